@@ -1,0 +1,1 @@
+"""Two LoRA adapters, motion and appearance, on one frozen video diffusion backbone."""
