@@ -1,0 +1,191 @@
+"""Objects in a frame: YOLOX networks run on batches of frames, decoded, and cleared of doubles.
+
+Boxes are left, top, right, bottom in pixels of the frame given, cut at its borders.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from labeling.model_cards import YoloxCard
+from labeling.onnx_model import DEFAULT_PROVIDERS, OnnxModel, check_frame, network_input
+from labeling.schemas import Category
+
+LETTERBOX_GREY = 114
+STRIDES = (8, 16, 32)
+_MAX_CANDIDATES = 2000
+"""Pairs of box and class that enter the suppression, best first: it bounds the time of the worst frame."""
+_MIN_SIDE_PX = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Detections:
+    """What a detector saw in one frame, best first."""
+
+    boxes_xyxy: np.ndarray
+    """(N, 4) float32, inside the frame, none of zero area."""
+    scores: np.ndarray
+    """(N,) float32, 0 to 1, descending."""
+    classes: np.ndarray
+    """(N,) str: the detector's name of each, such as ``truck``."""
+    categories: np.ndarray
+    """(N,) str: ``car`` or ``person``, or empty where the class is counted but not labelled."""
+    left_out: int = 0
+    """How many more there were than the card's ``max_detections``."""
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def select(self, keep: np.ndarray) -> "Detections":
+        """Those that ``keep`` (a mask or indices) names, in its order."""
+        return Detections(
+            boxes_xyxy=self.boxes_xyxy[keep], scores=self.scores[keep], classes=self.classes[keep],
+            categories=self.categories[keep], left_out=self.left_out,
+        )  # fmt: skip
+
+    def distinct(self, iou_threshold: float = 0.45) -> "Detections":
+        """Without those that a better one of the same category overlaps: a van seen as car and as truck is one object.
+
+        Classes without a category are left as they are.
+        """
+        groups = np.where(self.categories == "", self.classes, self.categories)
+        _, labels = np.unique(groups, return_inverse=True)
+        return self.select(suppress_overlaps(self.boxes_xyxy, labels, iou_threshold))
+
+    def of_category(self, category: Category) -> "Detections":
+        """The distinct objects of one category."""
+        chosen = self.select(self.categories == category)
+        return chosen.distinct()
+
+
+class Detector:
+    """A YOLOX network behind its card.
+
+    Raises:
+        ModelError: as ``OnnxModel``.
+    """
+
+    def __init__(
+        self,
+        card: YoloxCard,
+        path: Path,
+        *,
+        providers: Sequence[str] = DEFAULT_PROVIDERS,
+        threads: int = 1,
+        max_batch: int = 8,
+    ) -> None:
+        self.card = card
+        self.model = OnnxModel(card, path, providers=providers, threads=threads, max_batch=max_batch)
+
+    def detect(self, frames: Sequence[np.ndarray]) -> list[Detections]:
+        """Detections of each frame, (H, W, 3) uint8 RGB; sizes may differ.
+
+        Raises:
+            ModelError: a frame that is no RGB picture, or a network's output that is not finite.
+        """
+        if not len(frames):
+            return []
+        pictures = [letterbox(frame, self.card) for frame in frames]
+        (outputs,) = self.model.run(np.stack([picture for picture, _ in pictures]))
+        found = []
+        for output, frame, (_, ratio) in zip(outputs, frames, pictures, strict=True):
+            found.append(decode_yolox(output, self.card, ratio=ratio, width=frame.shape[1], height=frame.shape[0]))
+        return found
+
+
+def letterbox(frame: np.ndarray, card: YoloxCard) -> tuple[np.ndarray, float]:
+    """The network's input for one frame, and its scale relative to the frame.
+
+    The frame is scaled to fit (linear), put at the top left, and padded with grey 114.
+
+    Returns:
+        (3, input_height, input_width) float32 in the card's channel order and normalisation, and the scale.
+
+    Raises:
+        ModelError: the frame is not (H, W, 3) uint8, or empty.
+    """
+    check_frame(frame)
+    height, width = frame.shape[:2]
+    ratio = min(card.input_height / height, card.input_width / width)
+    inner = (max(1, int(width * ratio)), max(1, int(height * ratio)))
+    canvas = np.full((card.input_height, card.input_width, 3), LETTERBOX_GREY, np.uint8)
+    canvas[: inner[1], : inner[0]] = cv2.resize(frame, inner, interpolation=cv2.INTER_LINEAR)
+    return network_input(canvas, card), ratio
+
+
+def decode_yolox(output: np.ndarray, card: YoloxCard, *, ratio: float, width: int, height: int) -> Detections:
+    """Boxes of one frame from raw grid outputs (Ge et al. 2021, YOLOX): ``xy = (p + grid) s``, ``wh = exp(p) s``.
+
+    Args:
+        output: (sum(hw/s^2), 5 + C) float32; objectness and class scores are sigmoid already.
+        card: classes and thresholds.
+        ratio: network pixels per frame pixel.
+        width: of the frame; boxes are cut there, and those of no area left out.
+        height: of the frame.
+    """
+    scores = output[:, 4:5] * output[:, 5:]
+    rows, class_ids = np.nonzero(scores > card.score_threshold)
+    values = scores[rows, class_ids]
+    order = np.argsort(-values, kind="stable")[:_MAX_CANDIDATES]
+    rows, class_ids, values = rows[order], class_ids[order], values[order]
+    boxes = _decode_boxes(output[rows, :4], rows, card) / np.float32(ratio)
+    # Doubles are cleared before boxes are cut: two objects that leave the picture must not become one.
+    keep = suppress_overlaps(boxes, class_ids, card.nms_threshold)
+    boxes = np.clip(boxes, 0, np.array([width, height, width, height], np.float32))
+    sides = boxes[keep, 2:] - boxes[keep, :2]
+    keep = keep[(sides > _MIN_SIDE_PX).all(axis=1)]
+    best = keep[: card.max_detections]
+    names = np.array(card.class_names)
+    categories = np.array([card.categories.get(name, "") for name in card.class_names])
+    return Detections(
+        boxes_xyxy=boxes[best], scores=values[best], classes=names[class_ids[best]],
+        categories=categories[class_ids[best]], left_out=len(keep) - len(best),
+    )  # fmt: skip
+
+
+def suppress_overlaps(boxes_xyxy: np.ndarray, labels: np.ndarray, iou_threshold: float) -> np.ndarray:
+    """Greedy non-maximum suppression within each label.
+
+    Args:
+        boxes_xyxy: (N, 4), best first.
+        labels: (N,) integers; boxes of different labels never suppress each other.
+        iou_threshold: a box goes if a better one of its label overlaps it by more.
+
+    Returns:
+        Indices of the boxes that stay, best first.
+    """
+    areas = np.prod(np.maximum(boxes_xyxy[:, 2:] - boxes_xyxy[:, :2], 0), axis=1)
+    alive = np.ones(len(boxes_xyxy), bool)
+    kept = []
+    for i in range(len(boxes_xyxy)):
+        if not alive[i]:
+            continue
+        kept.append(i)
+        rivals = i + 1 + np.flatnonzero(alive[i + 1 :] & (labels[i + 1 :] == labels[i]))
+        corners = np.maximum(boxes_xyxy[rivals, :2], boxes_xyxy[i, :2])
+        sides = np.maximum(np.minimum(boxes_xyxy[rivals, 2:], boxes_xyxy[i, 2:]) - corners, 0)
+        shared = sides[:, 0] * sides[:, 1]
+        alive[rivals[shared > iou_threshold * (areas[rivals] + areas[i] - shared)]] = False
+    return np.array(kept, dtype=np.intp)
+
+
+def _decode_boxes(raw: np.ndarray, rows: np.ndarray, card: YoloxCard) -> np.ndarray:
+    cells, strides = _grid(card.input_width, card.input_height)
+    centres = (raw[:, :2] + cells[rows]) * strides[rows, None]
+    # exp(20) cells is beyond any picture, and finite.
+    halves = np.exp(np.minimum(raw[:, 2:], 20)) * (strides[rows, None] / 2)
+    return np.concatenate([centres - halves, centres + halves], axis=1)
+
+
+@functools.lru_cache(maxsize=8)
+def _grid(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    cells, strides = [], []
+    for stride in STRIDES:
+        columns, rows = np.meshgrid(np.arange(width // stride), np.arange(height // stride))
+        cells.append(np.stack([columns, rows], axis=2).reshape(-1, 2))
+        strides.append(np.full(columns.size, stride))
+    return np.concatenate(cells).astype(np.float32), np.concatenate(strides).astype(np.float32)
