@@ -64,8 +64,8 @@ def read_caption_table(path: Path) -> dict[str, str]:
         path: ``.csv`` (with a header), ``.parquet``, or ``.jsonl`` (one object a line).
 
     Raises:
-        DataError: the file is missing or unreadable, of another kind, lacks a column, or has an empty or repeated key or
-            an empty text.
+        DataError: the file is missing or unreadable, of another kind, lacks a column, or has an empty or repeated key
+            or an empty text.
     """
     readers = {".csv": _csv_rows, ".parquet": _parquet_rows, ".jsonl": _jsonl_rows}
     read = readers.get(path.suffix.lower())

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from labeling.errors import ConfigError
 from labeling.labels import Keypoints
 from labeling.schemas import CATEGORIES, Category, facts, keypoint_schema
+from labeling.skeleton_raster import Capsules, fill_capsules, mark_cells
 
 LABEL_WIDTH, LABEL_HEIGHT = 1056, 704
 """The picture that label coordinates are pixels of, unless said otherwise."""
@@ -53,18 +53,6 @@ class SkeletonStyle:
 DEFAULT_STYLE = SkeletonStyle()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Capsules:
-    """N shapes in drawing order: the geometry that both the picture and the mask of lit cells are made of."""
-
-    ends: np.ndarray
-    """(N, 4) float64: x0, y0, x1, y1, pixels of the target picture."""
-    radii: np.ndarray
-    """(N,) float64, pixels of the target picture."""
-    colours: np.ndarray
-    """(N, 3) uint8, RGB, none of them black."""
-
-
 def draw_skeletons(
     labels: Sequence[Keypoints], *, width: int, height: int, label_width: int = LABEL_WIDTH,
     label_height: int = LABEL_HEIGHT, style: SkeletonStyle = DEFAULT_STYLE,
@@ -89,7 +77,7 @@ def draw_skeletons(
         labels, width=width, height=height, label_width=label_width, label_height=label_height, style=style
     )
     picture = np.zeros((height, width, 3), np.uint8)
-    _fill(picture, shapes.ends, shapes.radii, shapes.colours)
+    fill_capsules(picture, shapes)
     return picture
 
 
@@ -121,7 +109,7 @@ def lit_cells(
         shapes = skeleton_capsules(
             labels, width=width, height=height, label_width=label_width, label_height=label_height, style=style
         )
-        _mark_cells(row, shapes.ends, shapes.radii, width, height, cell)
+        mark_cells(row, shapes, width=width, height=height, cell=cell)
     return lit
 
 
@@ -166,7 +154,7 @@ def edge_colours(schema: str) -> np.ndarray:
 def dot_edges(schema: str) -> np.ndarray:
     """(K,) int64: for each point one of its own edges, whose colour its dot takes; no two points share one.
 
-    A system of distinct representatives (Kuhn's augmenting paths); it exists because no part of a car's graph is a tree.
+    A system of distinct representatives (Kuhn's augmenting paths); no part of a car's graph is a tree, so one exists.
     With it a dot's colour says which point it is, and every pixel of a car keeps an edge's colour.
     """
     table = keypoint_schema(schema)
@@ -232,9 +220,8 @@ def _paint_cars(points: np.ndarray, schema: str, style: SkeletonStyle, size: flo
     dots = np.concatenate([points[..., :2], points[..., :2]], axis=-1)
     ends = np.concatenate([lines, dots], axis=1)
     drawn = np.concatenate([shown[:, first] & shown[:, second], shown], axis=1)
-    radii = np.concatenate([
-        np.full(len(first), _line_radius(style.car_line, size)), np.full(points.shape[1], _dot_radius(style.car_dot, size))
-    ])  # fmt: skip
+    line, dot = _line_radius(style.car_line, size), _dot_radius(style.car_dot, size)
+    radii = np.concatenate([np.full(len(first), line), np.full(points.shape[1], dot)])
     palette = np.concatenate([colours, colours[dot_edges(schema)]])
     of = np.broadcast_to(np.arange(len(radii)), drawn.shape)[drawn]
     return ends[drawn], radii[of], palette[of]
@@ -340,69 +327,3 @@ def _dot_radius(diameter: float, size: float) -> float:
 
 _PAINTERS = {"car": _paint_cars, "lane": _paint_lanes, "person": _paint_people}
 assert set(_PAINTERS) == set(CATEGORIES)
-
-
-@njit(cache=True)
-def _row_span(x0, y0, x1, y1, radius, y):  # pragma: no cover - compiled
-    """First and last x of a capsule on row y (an interval, for a capsule is convex); empty as (1, 0)."""
-    low, high = np.inf, -np.inf
-    for cx, cy in ((x0, y0), (x1, y1)):
-        reach = radius * radius - (y - cy) * (y - cy)
-        if reach >= 0:
-            half = math.sqrt(reach)
-            low, high = min(low, cx - half), max(high, cx + half)
-    dx, dy = x1 - x0, y1 - y0
-    length = math.sqrt(dx * dx + dy * dy)
-    if length > 0:
-        # The straight part: |cross| <= radius and 0 <= dot <= length, each an interval of x on this row.
-        start, end = -np.inf, np.inf
-        ux, uy = dx / length, dy / length
-        offset = y - y0
-        start, end, ok = _narrow(start, end, uy, -ux * offset - x0 * uy, -radius, radius)
-        if ok:
-            start, end, ok = _narrow(start, end, ux, uy * offset - x0 * ux, 0.0, length)
-        if ok and start <= end:
-            low, high = min(low, start), max(high, end)
-    return low, high
-
-
-@njit(cache=True)
-def _narrow(start, end, slope, offset, least, most):  # pragma: no cover - compiled
-    """[start, end] cut to where ``least <= slope * x + offset <= most``."""
-    if abs(slope) < 1e-12:
-        return start, end, least <= offset <= most
-    one, other = (least - offset) / slope, (most - offset) / slope
-    return max(start, min(one, other)), min(end, max(one, other)), True
-
-
-@njit(cache=True)
-def _row_range(low, high, limit):  # pragma: no cover - compiled
-    """Integers in [low, high] and [0, limit), half-open."""
-    return int(math.ceil(max(low, 0.0))), int(math.floor(min(high, limit - 1.0))) + 1
-
-
-@njit(cache=True)
-def _fill(picture, ends, radii, colours):  # pragma: no cover - compiled
-    height, width = picture.shape[:2]
-    for i in range(len(radii)):
-        x0, y0, x1, y1 = ends[i]
-        red, green, blue = colours[i]
-        top, bottom = _row_range(min(y0, y1) - radii[i], max(y0, y1) + radii[i], height)
-        for y in range(top, bottom):
-            low, high = _row_span(x0, y0, x1, y1, radii[i], y)
-            left, right = _row_range(low, high, width)
-            for x in range(left, right):
-                picture[y, x, 0], picture[y, x, 1], picture[y, x, 2] = red, green, blue
-
-
-@njit(cache=True)
-def _mark_cells(lit, ends, radii, width, height, cell):  # pragma: no cover - compiled
-    for i in range(len(radii)):
-        x0, y0, x1, y1 = ends[i]
-        top, bottom = _row_range(min(y0, y1) - radii[i], max(y0, y1) + radii[i], height)
-        for y in range(top, bottom):
-            low, high = _row_span(x0, y0, x1, y1, radii[i], y)
-            left, right = _row_range(low, high, width)
-            if left < right:
-                for column in range(left // cell, (right - 1) // cell + 1):
-                    lit[y // cell, column] = True
