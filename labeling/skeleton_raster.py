@@ -33,67 +33,82 @@ def mark_cells(lit: np.ndarray, shapes: Capsules, *, width: int, height: int, ce
     _mark_all(lit, shapes.ends, shapes.radii, width, height, cell)
 
 
-@njit(cache=True)
-def _row_span(x0, y0, x1, y1, radius, y):  # pragma: no cover - compiled
-    """First and last x of a capsule on row y (an interval, for a capsule is convex); empty as (1, 0)."""
+@njit(cache=True, error_model="numpy")
+def _row_span(x0, y0, x1, y1, radius, ux, uy, length, y):  # pragma: no cover - compiled
+    """First and last x of a capsule on row y (an interval, for a capsule is convex); empty where first > last."""
     low, high = np.inf, -np.inf
-    for cx, cy in ((x0, y0), (x1, y1)):
-        reach = radius * radius - (y - cy) * (y - cy)
-        if reach >= 0:
-            half = math.sqrt(reach)
-            low, high = min(low, cx - half), max(high, cx + half)
-    dx, dy = x1 - x0, y1 - y0
-    length = math.sqrt(dx * dx + dy * dy)
-    if length > 0:
-        # The straight part: |cross| <= radius and 0 <= dot <= length, each an interval of x on this row.
-        start, end = -np.inf, np.inf
-        ux, uy = dx / length, dy / length
-        offset = y - y0
-        start, end, ok = _narrow(start, end, uy, -ux * offset - x0 * uy, -radius, radius)
-        if ok:
-            start, end, ok = _narrow(start, end, ux, uy * offset - x0 * ux, 0.0, length)
-        if ok and start <= end:
-            low, high = min(low, start), max(high, end)
+    reach = radius * radius - (y - y0) * (y - y0)
+    if reach >= 0.0:
+        half = math.sqrt(reach)
+        low, high = x0 - half, x0 + half
+    if length == 0.0:
+        return low, high
+    reach = radius * radius - (y - y1) * (y - y1)
+    if reach >= 0.0:
+        half = math.sqrt(reach)
+        low, high = min(low, x1 - half), max(high, x1 + half)
+    # The straight part: |across| <= radius and 0 <= along <= length, each an interval of x on this row.
+    across = -ux * (y - y0) - x0 * uy
+    along = uy * (y - y0) - x0 * ux
+    start, end = _narrow(-np.inf, np.inf, uy, across, -radius, radius)
+    start, end = _narrow(start, end, ux, along, 0.0, length)
+    if start <= end:
+        low, high = min(low, start), max(high, end)
     return low, high
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _narrow(start, end, slope, offset, least, most):  # pragma: no cover - compiled
-    """[start, end] cut to where ``least <= slope * x + offset <= most``."""
+    """[start, end] cut to where ``least <= slope * x + offset <= most``; (inf, -inf) when that is nowhere."""
     if abs(slope) < 1e-12:
-        return start, end, least <= offset <= most
-    one, other = (least - offset) / slope, (most - offset) / slope
-    return max(start, min(one, other)), min(end, max(one, other)), True
+        if least <= offset <= most:
+            return start, end
+        return np.inf, -np.inf
+    inverse = 1.0 / slope
+    one, other = (least - offset) * inverse, (most - offset) * inverse
+    return max(start, min(one, other)), min(end, max(one, other))
 
 
-@njit(cache=True)
-def _row_range(low, high, limit):  # pragma: no cover - compiled
+@njit(cache=True, error_model="numpy")
+def _direction(x0, y0, x1, y1):  # pragma: no cover - compiled
+    dx, dy = x1 - x0, y1 - y0
+    length = math.sqrt(dx * dx + dy * dy)
+    if length == 0.0:
+        return 0.0, 0.0, 0.0
+    return dx / length, dy / length, length
+
+
+@njit(cache=True, error_model="numpy")
+def _whole(low, high, limit):  # pragma: no cover - compiled
     """Integers in [low, high] and [0, limit), half-open."""
-    return math.ceil(max(low, 0.0)), math.floor(min(high, limit - 1.0)) + 1
+    return math.ceil(min(max(low, 0.0), float(limit))), math.floor(max(min(high, limit - 1.0), -1.0)) + 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _fill_all(picture, ends, radii, colours):  # pragma: no cover - compiled
     height, width = picture.shape[:2]
     for i in range(len(radii)):
-        x0, y0, x1, y1 = ends[i]
-        red, green, blue = colours[i]
-        top, bottom = _row_range(min(y0, y1) - radii[i], max(y0, y1) + radii[i], height)
+        x0, y0, x1, y1 = ends[i, 0], ends[i, 1], ends[i, 2], ends[i, 3]
+        radius, red, green, blue = radii[i], colours[i, 0], colours[i, 1], colours[i, 2]
+        ux, uy, length = _direction(x0, y0, x1, y1)
+        top, bottom = _whole(min(y0, y1) - radius, max(y0, y1) + radius, height)
         for y in range(top, bottom):
-            low, high = _row_span(x0, y0, x1, y1, radii[i], y)
-            left, right = _row_range(low, high, width)
+            low, high = _row_span(x0, y0, x1, y1, radius, ux, uy, length, float(y))
+            left, right = _whole(low, high, width)
             for x in range(left, right):
                 picture[y, x, 0], picture[y, x, 1], picture[y, x, 2] = red, green, blue
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _mark_all(lit, ends, radii, width, height, cell):  # pragma: no cover - compiled
     for i in range(len(radii)):
-        x0, y0, x1, y1 = ends[i]
-        top, bottom = _row_range(min(y0, y1) - radii[i], max(y0, y1) + radii[i], height)
+        x0, y0, x1, y1 = ends[i, 0], ends[i, 1], ends[i, 2], ends[i, 3]
+        radius = radii[i]
+        ux, uy, length = _direction(x0, y0, x1, y1)
+        top, bottom = _whole(min(y0, y1) - radius, max(y0, y1) + radius, height)
         for y in range(top, bottom):
-            low, high = _row_span(x0, y0, x1, y1, radii[i], y)
-            left, right = _row_range(low, high, width)
+            low, high = _row_span(x0, y0, x1, y1, radius, ux, uy, length, float(y))
+            left, right = _whole(low, high, width)
             if left < right:
                 for column in range(left // cell, (right - 1) // cell + 1):
                     lit[y // cell, column] = True

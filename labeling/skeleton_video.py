@@ -17,7 +17,7 @@ import numpy as np
 
 from labeling.errors import ConfigError
 from labeling.labels import Keypoints
-from labeling.schemas import CATEGORIES, Category, facts, keypoint_schema
+from labeling.schemas import Category, facts, keypoint_schema
 from labeling.skeleton_raster import Capsules, fill_capsules, mark_cells
 
 LABEL_WIDTH, LABEL_HEIGHT = 1056, 704
@@ -28,7 +28,6 @@ _DRAWING_ORDER: dict[Category, int] = {"lane": 0, "car": 1, "person": 2}
 _WHITE = (255, 255, 255)
 _HAND_DOT = (0, 0, 255)
 _LANE_POINTS = 24
-_LANE_LEAST_POINTS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,12 +127,13 @@ def skeleton_capsules(
     size = math.sqrt(width * height / (_STYLE_WIDTH * _STYLE_HEIGHT))
     parts = []
     for group in _groups(labels):
-        points = np.stack([one.points for one in group]).astype(np.float64)
+        points = np.array([one.points for one in group], np.float64)
         # Pixel centres lie on integers, so a picture scales about -0.5.
         points[..., 0] = (points[..., 0] + 0.5) * scale_x - 0.5
         points[..., 1] = (points[..., 1] + 0.5) * scale_y - 0.5
-        points[..., 2] = np.minimum(points[..., 2], 1.0)
-        parts.append(_PAINTERS[group[0].category](points, group[0].schema, style, size))
+        points[..., 2] = np.clip(points[..., 2], 0.0, 1.0)
+        schema = group[0].schema
+        parts.append(_paint(_prepared(points, schema, style.min_score), _plan(schema, style, size), style.min_score))
     if not parts:
         return Capsules(ends=np.zeros((0, 4)), radii=np.zeros(0), colours=np.zeros((0, 3), np.uint8))
     ends, radii, colours = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -144,8 +144,7 @@ def skeleton_capsules(
 def edge_colours(schema: str) -> np.ndarray:
     """(E, 3) uint8 RGB: edge e of E has hue ``(240 - 360 e / E) mod 360`` degrees, full saturation and value."""
     count = len(keypoint_schema(schema).edges)
-    hues = [((240 - 360 * edge / count) % 360) / 360 for edge in range(count)]
-    colours = np.array([[round(255 * part) for part in colorsys.hsv_to_rgb(hue, 1.0, 1.0)] for hue in hues], np.uint8)
+    colours = _rainbow([240 - 360 * edge / count for edge in range(count)])
     colours.flags.writeable = False
     return colours
 
@@ -178,7 +177,7 @@ def complete_lane(points: np.ndarray, *, count: int = _LANE_POINTS) -> np.ndarra
         (count, 2) float64, evenly spaced by arc length from the first present point to the last; (0, 2) when fewer than
         two distinct points are present.
     """
-    steps = np.hypot(*np.diff(points, axis=0).T) if len(points) >= _LANE_LEAST_POINTS else np.zeros(0)
+    steps = np.hypot(*np.diff(points, axis=0).T) if len(points) > 1 else np.zeros(0)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     if along[-1] <= 0:
         return np.zeros((0, 2))
@@ -209,48 +208,100 @@ def _claim_edge(point: int, edges: tuple[tuple[int, int], ...], owner: dict[int,
     return False
 
 
-_Part = tuple[np.ndarray, np.ndarray, np.ndarray]
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Plan:
+    """How one object is drawn: S shapes in order, each between two of its points (a dot: twice the same)."""
+
+    start: np.ndarray
+    """(S,) int64, index of a point."""
+    stop: np.ndarray
+    """(S,) int64."""
+    radii: np.ndarray
+    """(S,) float64, pixels."""
+    colours: np.ndarray
+    """(S, 3) float64, RGB 0 to 255."""
+    shaded: bool
+    """Whether the score dims the colour."""
 
 
-def _paint_cars(points: np.ndarray, schema: str, style: SkeletonStyle, size: float) -> _Part:
-    colours = edge_colours(schema)
-    first, second = np.array(keypoint_schema(schema).edges).T
-    shown = points[..., 2] >= style.min_score
-    lines = np.concatenate([points[:, first, :2], points[:, second, :2]], axis=-1)
-    dots = np.concatenate([points[..., :2], points[..., :2]], axis=-1)
-    ends = np.concatenate([lines, dots], axis=1)
-    drawn = np.concatenate([shown[:, first] & shown[:, second], shown], axis=1)
-    line, dot = _line_radius(style.car_line, size), _dot_radius(style.car_dot, size)
-    radii = np.concatenate([np.full(len(first), line), np.full(points.shape[1], dot)])
-    palette = np.concatenate([colours, colours[dot_edges(schema)]])
-    of = np.broadcast_to(np.arange(len(radii)), drawn.shape)[drawn]
-    return ends[drawn], radii[of], palette[of]
+def _paint(points: np.ndarray, plan: _Plan, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ends, radii and colours of n objects of K points, (n, K, 3), one object after another."""
+    first, second = points[:, plan.start], points[:, plan.stop]
+    drawn = (first[..., 2] >= least) & (second[..., 2] >= least)
+    ends = np.concatenate([first[..., :2], second[..., :2]], axis=-1)[drawn]
+    shape = np.nonzero(drawn)[1]
+    colours = plan.colours[shape]
+    if plan.shaded:
+        # The geometric mean: a line of two equal scores is as bright as its dots.
+        colours = colours * np.sqrt(first[..., 2] * second[..., 2])[drawn][:, None]
+    return ends, plan.radii[shape], np.rint(colours).astype(np.uint8)
 
 
-def _paint_lanes(points: np.ndarray, schema: str, style: SkeletonStyle, size: float) -> _Part:
-    ends, radii = [np.zeros((0, 4))], [np.zeros(0)]
-    for lane in points:
-        line = complete_lane(lane[lane[:, 2] >= style.min_score, :2])
-        ends += [np.concatenate([line[:-1], line[1:]], axis=1), np.concatenate([line, line], axis=1)]
-        radii += [np.full(max(len(line) - 1, 0), _line_radius(style.lane_line, size))]
-        radii += [np.full(len(line), _dot_radius(style.lane_dot, size))]
-    stacked = np.concatenate(radii)
-    return np.concatenate(ends), stacked, np.full((len(stacked), 3), _WHITE, np.uint8)
+@functools.lru_cache(maxsize=64)
+def _plan(schema: str, style: SkeletonStyle, size: float) -> _Plan:
+    category = keypoint_schema(schema).category
+    parts = {"car": _car_parts, "lane": _lane_parts, "person": _person_parts}[category](schema, style)
+    start, stop, radii, colours = [], [], [], []
+    for pairs, palette, thickness in parts:
+        pairs = np.atleast_2d(pairs)
+        dots = pairs.shape[0] == 1
+        start.append(pairs[0])
+        stop.append(pairs[0] if dots else pairs[1])
+        radii.append(np.full(len(pairs[0]), _dot_radius(thickness * size) if dots else _line_radius(thickness * size)))
+        colours.append(np.broadcast_to(np.asarray(palette, np.float64), (len(pairs[0]), 3)))
+    return _Plan(
+        start=np.concatenate(start), stop=np.concatenate(stop), radii=np.concatenate(radii),
+        colours=np.concatenate(colours), shaded=category == "person",
+    )  # fmt: skip
 
 
-def _paint_people(points: np.ndarray, schema: str, style: SkeletonStyle, size: float) -> _Part:
-    body = openpose_body(points, schema)
-    table = facts()["openpose18"]
-    limbs, colours = np.array(table["limbs_zero_based"]), np.array(table["colours_rgb"], np.float64)
-    parts = [
-        _shaded_lines(body, limbs, colours[: len(limbs)], _line_radius(style.limb_line, size), style.min_score),
-        _shaded_dots(body, colours, _dot_radius(style.limb_dot, size), style.min_score),
+_Parts = list[tuple[np.ndarray, object, float]]
+"""(2, S) ends of lines or (S,) dots; an RGB colour for all or for each; the thickness in pixels of the style."""
+
+
+def _car_parts(schema: str, style: SkeletonStyle) -> _Parts:
+    table, colours = keypoint_schema(schema), edge_colours(schema)
+    return [
+        (np.array(table.edges).T, colours, style.car_line),
+        (np.arange(table.point_count), colours[dot_edges(schema)], style.car_dot),
     ]
-    if schema == "wholebody133":
-        parts += _hands_and_face(points, style, size)
-    # One person after another, each with all its parts.
-    ends, drawn, radii, shades = (np.concatenate([part[i] for part in parts], axis=1) for i in range(4))
-    return ends[drawn], radii[drawn], shades[drawn]
+
+
+def _lane_parts(schema: str, style: SkeletonStyle) -> _Parts:
+    points = np.arange(keypoint_schema(schema).point_count)
+    return [(np.stack([points[:-1], points[1:]]), _WHITE, style.lane_line), (points, _WHITE, style.lane_dot)]
+
+
+def _person_parts(schema: str, style: SkeletonStyle) -> _Parts:
+    table = facts()["openpose18"]
+    limbs, colours = np.array(table["limbs_zero_based"]).T, np.array(table["colours_rgb"])
+    body = colours.shape[0]
+    parts: _Parts = [(limbs, colours[: limbs.shape[1]], style.limb_line), (np.arange(body), colours, style.limb_dot)]
+    if schema != "wholebody133":
+        return parts
+    whole = facts()["wholebody133"]
+    fingers = np.array(whole["hand_edges_zero_based_within_hand"]).T
+    rainbow = _rainbow([360 * finger / fingers.shape[1] for finger in range(fingers.shape[1])])
+    for name in ("left_hand", "right_hand"):
+        first, end = (body + index for index in whole["slices"][name])
+        parts += [(first + fingers, rainbow, style.hand_line), (np.arange(first, end), _HAND_DOT, style.hand_dot)]
+    face = np.arange(*(body + index for index in whole["slices"]["face"]))
+    return [*parts, (face, _WHITE, style.face_dot)]
+
+
+def _prepared(points: np.ndarray, schema: str, least: float) -> np.ndarray:
+    """(n, K, 3) label points as (n, K', 3) points of the drawing: lanes completed, people in OpenPose's order."""
+    category = keypoint_schema(schema).category
+    if category == "person":
+        body = openpose_body(points, schema)
+        return np.concatenate([body, points], axis=1) if schema == "wholebody133" else body
+    if category == "lane":
+        lanes = np.zeros((len(points), points.shape[1], 3))
+        for lane, given in zip(lanes, points, strict=True):
+            line = complete_lane(given[given[:, 2] >= least, :2], count=len(lane))
+            lane[: len(line), :2], lane[: len(line), 2] = line, 1.0
+        return lanes
+    return points
 
 
 def openpose_body(points: np.ndarray, schema: str) -> np.ndarray:
@@ -274,56 +325,17 @@ def openpose_body(points: np.ndarray, schema: str) -> np.ndarray:
     return body
 
 
-_ShadedPart = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+def _rainbow(hues_deg: Sequence[float]) -> np.ndarray:
+    """(N, 3) uint8 RGB of full saturation and value."""
+    colours = [colorsys.hsv_to_rgb((hue % 360) / 360, 1.0, 1.0) for hue in hues_deg]
+    return np.rint(255 * np.array(colours)).astype(np.uint8)
 
 
-def _hands_and_face(points: np.ndarray, style: SkeletonStyle, size: float) -> list[_ShadedPart]:
-    table = facts()["wholebody133"]
-    fingers = np.array(table["hand_edges_zero_based_within_hand"])
-    rainbow = [[255 * part for part in colorsys.hsv_to_rgb(i / len(fingers), 1.0, 1.0)] for i in range(len(fingers))]
-    parts = []
-    for name in ("left_hand", "right_hand"):
-        hand = points[:, slice(*table["slices"][name])]
-        parts.append(
-            _shaded_lines(hand, fingers, np.array(rainbow), _line_radius(style.hand_line, size), style.min_score)
-        )
-        dots = np.tile(np.array(_HAND_DOT, np.float64), (hand.shape[1], 1))
-        parts.append(_shaded_dots(hand, dots, _dot_radius(style.hand_dot, size), style.min_score))
-    face = points[:, slice(*table["slices"]["face"])]
-    white = np.tile(np.array(_WHITE, np.float64), (face.shape[1], 1))
-    return [*parts, _shaded_dots(face, white, _dot_radius(style.face_dot, size), style.min_score)]
-
-
-def _shaded_lines(
-    points: np.ndarray, pairs: np.ndarray, colours: np.ndarray, radius: float, least: float
-) -> _ShadedPart:
-    """Lines whose brightness is the geometric mean of their ends' scores."""
-    one, other = points[:, pairs[:, 0]], points[:, pairs[:, 1]]
-    drawn = (one[..., 2] >= least) & (other[..., 2] >= least)
-    shade = np.sqrt(np.maximum(one[..., 2] * other[..., 2], 0.0))
-    ends = np.concatenate([one[..., :2], other[..., :2]], axis=-1)
-    return ends, drawn, np.full(drawn.shape, radius), _shaded(colours, shade)
-
-
-def _shaded_dots(points: np.ndarray, colours: np.ndarray, radius: float, least: float) -> _ShadedPart:
-    ends = np.concatenate([points[..., :2], points[..., :2]], axis=-1)
-    drawn = points[..., 2] >= least
-    return ends, drawn, np.full(drawn.shape, radius), _shaded(colours, points[..., 2])
-
-
-def _shaded(colours: np.ndarray, shade: np.ndarray) -> np.ndarray:
-    return np.rint(colours * shade[..., None]).astype(np.uint8)
-
-
-def _line_radius(width: float, size: float) -> float:
+def _line_radius(width: float) -> float:
     # A line one pixel wide lights at least one pixel of every column or row that it crosses.
-    return max(width * size, 1.0) / 2
+    return max(width, 1.0) / 2
 
 
-def _dot_radius(diameter: float, size: float) -> float:
+def _dot_radius(diameter: float) -> float:
     # The centre of some pixel is never farther than half a pixel's diagonal, so no dot is lost.
-    return max(diameter * size / 2, math.sqrt(0.5))
-
-
-_PAINTERS = {"car": _paint_cars, "lane": _paint_lanes, "person": _paint_people}
-assert set(_PAINTERS) == set(CATEGORIES)
+    return max(diameter / 2, math.sqrt(0.5))
