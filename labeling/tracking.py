@@ -1,0 +1,286 @@
+"""Track ids: which box of this frame is which object of the last.
+
+Constant-velocity prediction, association in two steps by score (Zhang et al. 2022, ByteTrack) on boxes that are grown
+so that small and fast ones still meet their predictions (Yang et al. 2023, C-BIoU), an optimal assignment, and the
+camera's own turn taken out of the prediction where it is known. Lanes are compared as lines.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from labeling.labels import UNTRACKED, Keypoints
+
+_FORBIDDEN = 1e6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackerSettings:
+    """What makes two boxes the same object. Times are in frames of the 24 fps grid."""
+
+    high_score: float = 0.5
+    """A box at least this sure may start a track and is matched first; the others only continue one."""
+    buffer: float = 0.3
+    """Boxes grow by this share of their size on each side before they are compared."""
+    lost_buffer: float = 0.6
+    """The same for tracks that have not been seen for a while: their prediction is less sure."""
+    min_overlap: float = 0.15
+    """Least IoU of the buffered boxes."""
+    max_lost_frames: int = 30
+    """An object that was hidden for longer comes back as a new one: one second, and a little for its borders."""
+    max_size_ratio: float = 1.9
+    """A box may not be that much larger or smaller than its prediction (its height, whichever way)."""
+
+
+@dataclass(slots=True, kw_only=True)
+class _Track:
+    track_id: int
+    mean: np.ndarray
+    """(4, 2): centre x, centre y, log width, log height, each with its change per frame."""
+    covariance: np.ndarray
+    """(4, 2, 2)."""
+    lost_frames: int
+
+    @property
+    def box_xyxy(self) -> np.ndarray:
+        centre, size = self.mean[:2, 0], np.exp(np.clip(self.mean[2:, 0], -3, 9))
+        return np.concatenate([centre - size / 2, centre + size / 2])
+
+
+class BoxTracker:
+    """Gives ids to boxes, frame after frame, one category at a time.
+
+    The state is four independent constant-velocity Kalman filters (centre and log size), so that a box that grows as it
+    comes nearer keeps its rate of growth.
+    """
+
+    def __init__(self, settings: TrackerSettings | None = None, *, first_id: int = 0) -> None:
+        self.settings = settings or TrackerSettings()
+        self.next_id = first_id
+        self._tracks: list[_Track] = []
+
+    def update(
+        self,
+        boxes_xyxy: np.ndarray,
+        scores: np.ndarray,
+        *,
+        frame_step: int = 1,
+        previous_to_current: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Ids for the boxes of the next frame.
+
+        Args:
+            boxes_xyxy: (N, 4) pixels.
+            scores: (N,) 0 to 1.
+            frame_step: frames since the last call.
+            previous_to_current: (3, 3) homography that the camera's turn since the last call makes of far points.
+
+        Returns:
+            (N,) int ids; ``UNTRACKED`` for boxes too unsure to start a track.
+        """
+        boxes = np.asarray(boxes_xyxy, np.float64).reshape(-1, 4)
+        for track in self._tracks:
+            _predict(track, frame_step)
+            if previous_to_current is not None:
+                _move_with_camera(track, previous_to_current)
+        ids = np.full(len(boxes), UNTRACKED)
+        high = np.flatnonzero(scores >= self.settings.high_score)
+        low = np.flatnonzero(scores < self.settings.high_score)
+        seen = [track for track in self._tracks if track.lost_frames <= frame_step]
+        lost = [track for track in self._tracks if track.lost_frames > frame_step]
+        high = self._associate(seen, boxes, ids, high, buffer=self.settings.buffer)
+        high = self._associate(lost, boxes, ids, high, buffer=self.settings.lost_buffer)
+        unmatched = [track for track in seen if track.lost_frames]
+        self._associate(unmatched, boxes, ids, low, buffer=self.settings.buffer)
+        for index in high:
+            ids[index] = self._start(boxes[index])
+        self._tracks = [track for track in self._tracks if track.lost_frames <= self.settings.max_lost_frames]
+        return ids
+
+    def _associate(
+        self, tracks: list[_Track], boxes: np.ndarray, ids: np.ndarray, chosen: np.ndarray, *, buffer: float
+    ) -> np.ndarray:
+        """Match ``chosen`` boxes to tracks, update both; returns the boxes that found none."""
+        if not tracks or not len(chosen):
+            return chosen
+        predicted = np.stack([track.box_xyxy for track in tracks])
+        overlap = iou(_grown(predicted, buffer), _grown(boxes[chosen], buffer))
+        heights = np.log(_heights(boxes[chosen])[None] / _heights(predicted)[:, None])
+        allowed = (overlap >= self.settings.min_overlap) & (np.abs(heights) <= np.log(self.settings.max_size_ratio))
+        rows, columns = linear_sum_assignment(np.where(allowed, 1 - overlap, _FORBIDDEN))
+        taken = np.zeros(len(chosen), bool)
+        for row, column in zip(rows, columns, strict=True):
+            if allowed[row, column]:
+                taken[column] = True
+                _correct(tracks[row], boxes[chosen[column]])
+                ids[chosen[column]] = tracks[row].track_id
+        return chosen[~taken]
+
+    def _start(self, box_xyxy: np.ndarray) -> int:
+        mean = np.zeros((4, 2))
+        mean[:, 0] = _measurement(box_xyxy)
+        spread = np.array([_size_px(box_xyxy) * 0.1, _size_px(box_xyxy) * 0.1, 0.1, 0.1])
+        covariance = np.zeros((4, 2, 2))
+        covariance[:, 0, 0], covariance[:, 1, 1] = spread**2, spread**2
+        self._tracks.append(_Track(track_id=self.next_id, mean=mean, covariance=covariance, lost_frames=0))
+        self.next_id += 1
+        return self.next_id - 1
+
+
+def assign_tracks(
+    frames: Sequence[Sequence[Keypoints]],
+    *,
+    settings: TrackerSettings | None = None,
+    breaks: frozenset[int] = frozenset(),
+    homographies: Sequence[np.ndarray | None] | None = None,
+) -> list[list[Keypoints]]:
+    """Labels with track ids, those that belong to no track left out.
+
+    Ids count from 0 over all categories of a run, in the order in which objects appear, and start afresh at each break.
+
+    Args:
+        frames: the labels of consecutive frames.
+        settings: thresholds.
+        breaks: positions in ``frames`` before which nothing may be carried over (a hard cut, a hole).
+        homographies: for each frame, how the camera's turn moved far points since the one before; or None.
+    """
+    trackers: dict[str, BoxTracker | LaneTracker] = {}
+    next_id = 0
+    tracked: list[list[Keypoints]] = []
+    for position, labels in enumerate(frames):
+        if position in breaks:
+            trackers = {}
+        turn = homographies[position] if homographies is not None else None
+        out: list[Keypoints] = []
+        for category in sorted({label.category for label in labels} | set(trackers)):
+            group = [label for label in labels if label.category == category]
+            tracker = trackers.get(category) or (LaneTracker() if category == "lane" else BoxTracker(settings))
+            trackers[category] = tracker
+            tracker.next_id = next_id
+            ids = _update(tracker, group, turn)
+            next_id = tracker.next_id
+            out += [replace(label, track_id=int(i)) for label, i in zip(group, ids, strict=True) if i != UNTRACKED]
+        tracked.append(out)
+    return tracked
+
+
+def drop_short_tracks(frames: Sequence[Sequence[Keypoints]], *, min_frames: int) -> list[list[Keypoints]]:
+    """Without the tracks that were seen in fewer than ``min_frames`` frames: a network's passing mistakes."""
+    seen: dict[int, int] = {}
+    for labels in frames:
+        for label in labels:
+            seen[label.track_id] = seen.get(label.track_id, 0) + 1
+    return [[label for label in labels if seen[label.track_id] >= min_frames] for labels in frames]
+
+
+class LaneTracker:
+    """Ids for lane lines: the nearest line of the last frames, compared where both reach, bottom weighted most."""
+
+    def __init__(self, *, first_id: int = 0, max_distance_px: float = 60.0, max_lost_frames: int = 24) -> None:
+        self.next_id = first_id
+        self.max_distance_px, self.max_lost_frames = max_distance_px, max_lost_frames
+        self._lines: dict[int, tuple[np.ndarray, int]] = {}
+
+    def update(self, lines: Sequence[np.ndarray]) -> np.ndarray:
+        """Ids for the lines of the next frame, each (K, 3) x, y, score in pixels; absent points have score 0."""
+        ids = np.full(len(lines), UNTRACKED)
+        known = sorted(self._lines)
+        if known and len(lines):
+            cost = np.array([[line_distance(self._lines[i][0], line) for line in lines] for i in known])
+            rows, columns = linear_sum_assignment(np.minimum(cost, _FORBIDDEN))
+            for row, column in zip(rows, columns, strict=True):
+                if cost[row, column] <= self.max_distance_px:
+                    ids[column] = known[row]
+        for column in np.flatnonzero(ids == UNTRACKED):
+            ids[column] = self.next_id
+            self.next_id += 1
+        self._lines = {i: (line, age + 1) for i, (line, age) in self._lines.items() if age < self.max_lost_frames}
+        self._lines |= {int(i): (np.asarray(line), 0) for i, line in zip(ids, lines, strict=True)}
+        return ids
+
+
+def line_distance(line_a: np.ndarray, line_b: np.ndarray) -> float:
+    """Mean horizontal distance of two lines over the rows that both cross, pixels; infinite where they share none.
+
+    Args:
+        line_a: (K, 3) x, y, score.
+        line_b: (K, 3).
+    """
+    ordered = []
+    for line in (line_a, line_b):
+        present = line[line[:, 2] > 0]
+        ordered.append(present[np.argsort(present[:, 1], kind="stable")])
+    if min(map(len, ordered)) < 2:
+        return float("inf")
+    top = max(line[0, 1] for line in ordered)
+    bottom = min(line[-1, 1] for line in ordered)
+    if bottom <= top:
+        return float("inf")
+    rows = np.linspace(top, bottom, 12)
+    columns = [np.interp(rows, line[:, 1], line[:, 0]) for line in ordered]
+    # Lines fan out towards the camera: the lower rows tell them apart, the upper ones all meet.
+    return float(np.average(np.abs(columns[0] - columns[1]), weights=np.linspace(0.5, 1.5, 12)))
+
+
+def iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
+    """(N, M) intersection over union of (N, 4) and (M, 4) boxes, left top right bottom."""
+    corner = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
+    sides = np.clip(np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:]) - corner, 0, None)
+    shared = sides.prod(axis=2)
+    area_a, area_b = ((boxes[:, 2:] - boxes[:, :2]).clip(0).prod(axis=1) for boxes in (boxes_a, boxes_b))
+    return shared / np.maximum(area_a[:, None] + area_b[None] - shared, 1e-9)
+
+
+def _update(tracker: BoxTracker | LaneTracker, group: list[Keypoints], turn: np.ndarray | None) -> np.ndarray:
+    if isinstance(tracker, LaneTracker):
+        return tracker.update([label.points for label in group])
+    boxes = np.array([label.box_xyxy for label in group], np.float64).reshape(-1, 4)
+    return tracker.update(boxes, np.array([label.score for label in group]), previous_to_current=turn)
+
+
+def _grown(boxes_xyxy: np.ndarray, buffer: float) -> np.ndarray:
+    margin = (boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]) * buffer
+    return np.concatenate([boxes_xyxy[:, :2] - margin, boxes_xyxy[:, 2:] + margin], axis=1)
+
+
+def _heights(boxes_xyxy: np.ndarray) -> np.ndarray:
+    return np.maximum(boxes_xyxy[:, 3] - boxes_xyxy[:, 1], 1e-3)
+
+
+def _size_px(box_xyxy: np.ndarray) -> float:
+    return float(np.maximum(box_xyxy[2:] - box_xyxy[:2], 1e-3).mean())
+
+
+def _measurement(box_xyxy: np.ndarray) -> np.ndarray:
+    size = np.maximum(box_xyxy[2:] - box_xyxy[:2], 1e-3)
+    return np.concatenate([(box_xyxy[:2] + box_xyxy[2:]) / 2, np.log(size)])
+
+
+def _predict(track: _Track, steps: int) -> None:
+    transition = np.array([[1.0, steps], [0.0, 1.0]])
+    if track.lost_frames:
+        # A rate of growth is measured badly: it is not trusted once nothing confirms it.
+        track.mean[2:, 1] *= 0.8**steps
+    track.mean = track.mean @ transition.T
+    # White acceleration (Bar-Shalom et al. 2001, eq. 6.3.2-4), in shares of the object's size per frame squared.
+    size = float(np.exp(np.clip(track.mean[2:, 0].mean(), -3, 9)))
+    strength = np.array([0.012 * size, 0.012 * size, 0.006, 0.006]) ** 2
+    noise = np.array([[steps**3 / 3, steps**2 / 2], [steps**2 / 2, steps]])
+    track.covariance = transition @ track.covariance @ transition.T + strength[:, None, None] * noise
+    track.lost_frames += steps
+
+
+def _correct(track: _Track, box_xyxy: np.ndarray) -> None:
+    sigma = np.array([0.03 * _size_px(box_xyxy), 0.03 * _size_px(box_xyxy), 0.04, 0.04])
+    innovation = _measurement(box_xyxy) - track.mean[:, 0]
+    gain = track.covariance[:, :, 0] / (track.covariance[:, 0, 0] + sigma**2)[:, None]
+    track.mean = track.mean + gain * innovation[:, None]
+    track.covariance = track.covariance - gain[:, :, None] * track.covariance[:, :1, :]
+    track.lost_frames = 0
+
+
+def _move_with_camera(track: _Track, previous_to_current: np.ndarray) -> None:
+    moved = previous_to_current @ np.array([*track.mean[:2, 0], 1.0])
+    track.mean[:2, 0] = moved[:2] / moved[2]

@@ -1,0 +1,129 @@
+"""Track ids on made-up motion whose right answer is known."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from labeling.labels import UNTRACKED, Keypoints
+from labeling.tracking import BoxTracker, LaneTracker, assign_tracks, drop_short_tracks, iou, line_distance
+
+
+def box(x: float, y: float = 300, *, width: float = 40, height: float = 100) -> np.ndarray:
+    return np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
+
+
+def follow(
+    paths: Sequence[Sequence[np.ndarray | None]], *, scores: list[float] | None = None, **changes: int
+) -> np.ndarray:
+    """(frames, objects) ids for the paths of several objects; None where an object is not detected."""
+    tracker = BoxTracker()
+    table = np.full((len(paths[0]), len(paths)), UNTRACKED)
+    for frame in range(len(paths[0])):
+        seen = [i for i, path in enumerate(paths) if path[frame] is not None]
+        boxes = np.array([paths[i][frame] for i in seen]).reshape(-1, 4)
+        marks = np.array([(scores or [0.9] * len(paths))[i] for i in seen])
+        table[frame, seen] = tracker.update(boxes, marks, **changes)
+    return table
+
+
+def test_steady_motion_keeps_its_id() -> None:
+    ids = follow([[box(50 + 6 * t) for t in range(60)], [box(900 - 3 * t) for t in range(60)]])
+    assert len(set(ids[:, 0])) == len(set(ids[:, 1])) == 1 and ids[0, 0] != ids[0, 1]
+
+
+def test_one_second_occlusion_keeps_its_id() -> None:
+    path = [box(100 + 4 * t) if not 30 <= t < 54 else None for t in range(90)]
+    ids = follow([path])
+    assert set(ids[:30, 0]) == set(ids[54:, 0]) and len(set(ids[:30, 0])) == 1
+
+
+def test_long_absence_is_a_new_object() -> None:
+    path = [box(100) if not 30 <= t < 100 else None for t in range(120)]
+    ids = follow([path])
+    assert ids[0, 0] != ids[-1, 0]
+
+
+def test_crossing_people_do_not_swap() -> None:
+    """Two people walk towards each other; while they overlap only the nearer one is detected."""
+    left = [box(300 + 5 * t) for t in range(80)]
+    right: list[np.ndarray | None] = [box(700 - 5 * t) for t in range(80)]
+    for t in range(80):
+        if abs((300 + 5 * t) - (700 - 5 * t)) < 30:
+            right[t] = None
+    ids = follow([left, right])
+    assert len(set(ids[:, 0])) == 1
+    assert set(ids[:30, 1]) == set(ids[60:, 1])
+    assert ids[0, 0] != ids[0, 1]
+
+
+def test_small_fast_objects_are_kept() -> None:
+    ids = follow([[box(100 + 11 * t, width=12, height=10) for t in range(40)]])
+    assert len(set(ids[2:, 0])) == 1
+
+
+def test_unsure_boxes_continue_a_track_but_start_none() -> None:
+    assert (follow([[box(100 + t) for t in range(5)]], scores=[0.3]) == UNTRACKED).all()
+    tracker = BoxTracker()
+    first = tracker.update(box(100)[None], np.array([0.9]))
+    second = tracker.update(box(101)[None], np.array([0.3]))
+    assert first == second
+
+
+def test_frame_steps_scale_the_prediction() -> None:
+    every, fourth = BoxTracker(), BoxTracker()
+    dense = [every.update(box(50 + 5 * t)[None], np.ones(1))[0] for t in range(40)]
+    sparse = [fourth.update(box(50 + 5 * t)[None], np.ones(1), frame_step=4)[0] for t in range(0, 40, 4)]
+    assert len(set(dense)) == 1 and len(set(sparse)) == 1
+
+
+def test_known_camera_turn_saves_the_match() -> None:
+    """A turn that moves everything by 90 px at once: lost without it, held with it."""
+    shift = np.array([[1.0, 0, 90], [0, 1, 0], [0, 0, 1]])
+    for turn, same in ((None, False), (shift, True)):
+        tracker = BoxTracker()
+        before = [tracker.update(box(300, width=30)[None], np.ones(1))[0] for _ in range(3)][-1]
+        after = tracker.update(box(390, width=30)[None], np.ones(1), previous_to_current=turn)[0]
+        assert bool(before == after) is same
+
+
+def car(frame: int, x: float) -> Keypoints:
+    return Keypoints(
+        frame=frame, category="car", schema="car24", score=0.9, box_xyxy=box(x).astype(np.float32),
+        points=np.zeros((24, 3), np.float32), point_source=np.zeros(24, np.int8),
+    )  # fmt: skip
+
+
+def test_nothing_is_carried_over_a_break() -> None:
+    frames = [[car(t, 100 + t)] for t in range(10)]
+    whole = assign_tracks(frames)
+    cut = assign_tracks(frames, breaks=frozenset({5}))
+    assert {label.track_id for labels in whole for label in labels} == {0}
+    assert [labels[0].track_id for labels in cut] == [0] * 5 + [1] * 5
+
+
+def test_short_tracks_are_dropped_and_only_they() -> None:
+    frames = [[car(t, 100)] + ([car(t, 800)] if t == 4 else []) for t in range(10)]
+    kept = drop_short_tracks(assign_tracks(frames), min_frames=3)
+    assert [len(labels) for labels in kept] == [1] * 10
+
+
+def lane(offset: float) -> np.ndarray:
+    rows = np.linspace(700, 400, 24)
+    return np.stack([528 + (offset + rows - 400) * 0.8, rows, np.ones(24)], axis=1)
+
+
+def test_lanes_keep_their_ids_while_they_drift() -> None:
+    tracker = LaneTracker()
+    ids = [tracker.update([lane(-150 + 2 * t), lane(150 + 2 * t)]).tolist() for t in range(20)]
+    assert ids == [[0, 1]] * 20
+
+
+def test_line_distance_is_the_horizontal_gap() -> None:
+    assert line_distance(lane(0), lane(50)) == pytest.approx(40)
+    assert line_distance(lane(0), np.zeros((24, 3))) == float("inf")
+
+
+def test_iou_by_hand() -> None:
+    boxes = np.array([[0, 0, 2, 2.0], [1, 1, 3, 3.0]])
+    assert iou(boxes, boxes) == pytest.approx(np.array([[1, 1 / 7], [1 / 7, 1]]))
