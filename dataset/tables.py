@@ -56,6 +56,7 @@ EGO_SCHEMA = pa.schema(
         ("mode", _TEXT),
         ("confidence", _F32),
         ("scale_source", _TEXT),
+        ("scale_sigma", _F32),
     ]
 )
 """One row per frame of a run: the pose in the run's first camera, row-major."""
@@ -260,10 +261,12 @@ class EgoTable:
     """(T,) float32, 0 to 1."""
     scale_source: list[str]
     """T times road, held or default: what metres rest on."""
-    scale_sigma: float
-    """One sigma of the scale, relative to it."""
+    scale_sigma: np.ndarray
+    """(T,) float32: one sigma of the scale, relative to it."""
     intrinsics: Intrinsics
     """Of the working picture."""
+    camera: dict[str, float | None]
+    """Height over the road and pitch against it, with the pitch's sigma (null where no road was seen)."""
 
 
 def write_ego(path: Path, motion: "EgoMotion", *, first_frame: int) -> None:
@@ -276,9 +279,11 @@ def write_ego(path: Path, motion: "EgoMotion", *, first_frame: int) -> None:
         pa.array([str(mode) for mode in motion.mode], _TEXT),
         pa.array(np.asarray(motion.confidence, dtype=np.float32), _F32),
         pa.array([str(source) for source in motion.scale_source], _TEXT),
+        pa.array(np.asarray(motion.scale_sigma, dtype=np.float32), _F32),
     ]
-    sigma = float(np.max(np.asarray(motion.scale_sigma, dtype=np.float64)))
-    metadata = {"intrinsics": asdict(motion.intrinsics), "scale_sigma": sigma if np.isfinite(sigma) else None}
+    camera = {name: getattr(motion, name) for name in ("camera_height_m", "pitch_rad", "pitch_sigma_rad")}
+    finite = {name: float(value) if np.isfinite(value) else None for name, value in camera.items()}
+    metadata = {"intrinsics": asdict(motion.intrinsics), "camera": finite}
     write_table(path, pa.Table.from_arrays(columns, schema=EGO_SCHEMA), metadata=metadata)
 
 
@@ -286,15 +291,15 @@ def read_ego(path: Path) -> EgoTable:
     """A run's camera motion."""
     table, metadata = read_table(path, EGO_SCHEMA)
     poses = np.asarray(table["cam_to_world"].combine_chunks().flatten(), dtype=np.float64).reshape(-1, 4, 4)
-    sigma = metadata["scale_sigma"]
     return EgoTable(
         frame=_column(table, "frame"),
         trajectory=Trajectory(timestamps_s=_column(table, "time_s"), cam_to_world=poses),
         mode=table["mode"].to_pylist(),
         confidence=_column(table, "confidence"),
         scale_source=table["scale_source"].to_pylist(),
-        scale_sigma=float("inf") if sigma is None else float(sigma),
+        scale_sigma=_column(table, "scale_sigma"),
         intrinsics=Intrinsics(**metadata["intrinsics"]),
+        camera=metadata["camera"],
     )
 
 

@@ -1,0 +1,231 @@
+"""The settings of a job: nested, strict, in YAML; and its presets, which are functions that return one."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from labeling.ego_motion import EgoSettings
+from labeling.encoding import EncoderSettings, lossless_rgb
+from labeling.errors import ConfigError
+from labeling.timeline import ClipSettings
+
+Effort = Literal["fast", "balanced", "exact"]
+EFFORTS: tuple[Effort, ...] = ("fast", "balanced", "exact")
+
+COUNTED_CLASSES = ("car", "truck", "bus", "motorcycle", "bicycle", "person")
+
+
+class Settings(BaseModel):
+    """Settings know their fields, refuse others, and never change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class PictureSettings(Settings):
+    """The working picture: sources are scaled to cover it and centre-cropped."""
+
+    width: int = Field(default=1056, ge=16, multiple_of=2)
+    height: int = Field(default=704, ge=16, multiple_of=2)
+
+
+class CameraSettings(Settings):
+    """A calibrated camera, in pixels of the source. Without one the focal length is assumed."""
+
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+
+
+class CountSettings(Settings):
+    """How objects are counted, on the source's own keyframes."""
+
+    detector: str | None = None
+    """A model card's name; by default the first detector whose weights are there."""
+    looks_per_clip: int = Field(default=2, ge=1)
+    """Frames to look at in each clip; where keyframes are rarer, others are sought out."""
+    threads: int = Field(default=1, ge=1)
+
+
+class SelectSettings(Settings):
+    """Which clips are kept, and which split they go to."""
+
+    keep_share: float = Field(default=0.5, gt=0, le=1)
+    """Share of the clips with the most objects; ties at the threshold are kept. 1 keeps every clip uncounted."""
+    classes: tuple[str, ...] | Literal["cars"] = COUNTED_CLASSES
+    """What counts as an object; ``cars`` is the released rule."""
+    min_score: float = Field(default=0.3, ge=0, le=1)
+    """Detections that score less do not count."""
+    seed: int = 0
+    sample_clips: int | None = Field(default=None, ge=1)
+    """How many of the kept clips to take, by rank of hash(seed, key); all by default."""
+    val_share: float = Field(default=0.1, ge=0, lt=1)
+    """Share of the source videos that go to val, by hash(seed, video id)."""
+    split: dict[str, Literal["train", "val"]] | None = None
+    """The split of each video by name, instead of the hash (``--split FILE``)."""
+
+    @property
+    def counted_classes(self) -> tuple[str, ...]:
+        """Class names that count."""
+        return ("car",) if self.classes == "cars" else self.classes
+
+
+class KeypointSettings(Settings):
+    """How keypoints are extracted and tracked."""
+
+    extractors: tuple[str, ...] | None = None
+    """Card names, or ``street`` for the small shipped models; by default every card whose weights are there, the
+    street models aside."""
+    effort: Effort = "balanced"
+    threads: int = Field(default=1, ge=1)
+    providers: tuple[str, ...] = ("CPUExecutionProvider",)
+    """Execution providers in order; a missing one is an error, never a silent CPU."""
+
+
+class EgoStageSettings(Settings):
+    """How the camera's motion is estimated."""
+
+    camera_height_m: float = Field(default=1.5, gt=0)
+    motion: EgoSettings = EgoSettings()
+
+
+class ViewSettings(Settings):
+    """The control videos and captions."""
+
+    width: int = Field(default=768, ge=16, multiple_of=2)
+    height: int = Field(default=512, ge=16, multiple_of=2)
+    skeleton_encoder: EncoderSettings = lossless_rgb()
+    """Lossless, in RGB: 4:2:0 loses the skeletons' colours."""
+    view_encoder: EncoderSettings = EncoderSettings()
+    """For ego and object videos."""
+    ego_style: Literal["world", "released"] = "world"
+    ego_renderer: Literal["remap", "pyvista"] = "remap"
+    ego_seed: int = 0
+    object_variant: int = 0
+    """Another number chooses other tracks."""
+    captions: str | None = None
+    """A table of key and text; clips that it lacks get the template's caption."""
+
+
+class PackSettings(Settings):
+    """How samples are packed."""
+
+    shard_bytes: int = Field(default=750_000_000, ge=1)
+    """Shards are filled up to this size."""
+    videos: Literal["all", "rgb"] = "all"
+    """``rgb`` leaves the three views out: they can be drawn again from labels."""
+
+
+class Config(Settings):
+    """All settings of a job."""
+
+    clip: ClipSettings = ClipSettings()
+    picture: PictureSettings = PictureSettings()
+    camera: CameraSettings | None = None
+    encoder: EncoderSettings = EncoderSettings()
+    count: CountSettings = CountSettings()
+    select: SelectSettings = SelectSettings()
+    keypoints: KeypointSettings = KeypointSettings()
+    ego: EgoStageSettings = EgoStageSettings()
+    views: ViewSettings = ViewSettings()
+    pack: PackSettings = PackSettings()
+
+    @model_validator(mode="after")
+    def _strides_fall_on_keyframes(self) -> "Config":
+        for name, encoder in (("encoder", self.encoder), ("views.skeleton_encoder", self.views.skeleton_encoder)):
+            if self.clip.stride_frames % encoder.gop_frames or self.clip.run_frames % self.clip.stride_frames:
+                raise ValueError(
+                    f"{name}.gop_frames {encoder.gop_frames} must divide clip.stride_frames {self.clip.stride_frames}, "
+                    f"and that clip.run_frames {self.clip.run_frames}: clips are cut at keyframes"
+                )
+        return self
+
+
+def with_effort(config: Config, effort: Effort) -> Config:
+    """``config`` at another point of the fronts of speed against accuracy."""
+    looks = {"fast": 1, "balanced": 2, "exact": 8}[effort]
+    return merged(config, {"count": {"looks_per_clip": looks}, "keypoints": {"effort": effort}})
+
+
+def merged(config: Config, changes: Mapping[str, Any]) -> Config:
+    """``config`` with nested changes.
+
+    Raises:
+        ConfigError: a change that no setting allows.
+    """
+    return parse_config(_deep_merge(config.model_dump(mode="json"), changes), "settings")
+
+
+def parse_config(values: Mapping[str, Any], name: str) -> Config:
+    """A configuration from plain values; what is not given has its default.
+
+    Raises:
+        ConfigError: an unknown key, or a value out of range, with its path.
+    """
+    return parse_settings(Config, values, name)
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def parse_settings(model: type[Model], values: Mapping[str, Any], name: str) -> Model:
+    """Any settings from plain values.
+
+    Raises:
+        ConfigError: an unknown key, or a value out of range, with its path.
+    """
+    try:
+        return model.model_validate(dict(values))
+    except ValidationError as error:
+        faults = "; ".join(_fault(model, fault) for fault in error.errors())
+        raise ConfigError(f"{name}: {faults}") from error
+
+
+def _fault(model: type[BaseModel], fault: Any) -> str:
+    place = ".".join(str(part) for part in fault["loc"]) or "settings"
+    if fault["type"] != "extra_forbidden":
+        return f"{place}: {fault['msg'].lower().removeprefix('value error, ')}, got {fault['input']!r}"
+    known: Any = model
+    for part in fault["loc"][:-1]:
+        known = known.model_fields[part].annotation if hasattr(known, "model_fields") else None
+    fields = ", ".join(known.model_fields) if hasattr(known, "model_fields") else "none"
+    return f"{place} is not a setting; choose one of {fields}"
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML file that holds a mapping.
+
+    Raises:
+        ConfigError: it cannot be read, is no YAML, or holds something else.
+    """
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error}); check the path") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: is no YAML ({' '.join(str(error).split())}); mend it") from error
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: needs a mapping of settings, holds {type(values).__name__}")
+    return values
+
+
+def read_config(path: Path) -> Config:
+    """The configuration in a YAML file.
+
+    Raises:
+        ConfigError: as ``read_yaml`` and ``parse_config``.
+    """
+    return parse_config(read_yaml(path), str(path))
+
+
+def _deep_merge(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    result = dict(values)
+    for name, change in changes.items():
+        known = result.get(name)
+        result[name] = _deep_merge(known, change) if isinstance(change, Mapping) and isinstance(known, dict) else change
+    return result

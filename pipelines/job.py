@@ -1,0 +1,241 @@
+"""A job: its folder, its settings and its source videos, as ``job.yaml`` holds them."""
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dataset.receipts import Receipt, atomic_write, read_receipts
+from labeling.errors import ConfigError
+from labeling.timeline import check_video_id
+from pipelines.config import Config, parse_config, read_yaml
+from pipelines.stage import WorkItem, item_state, load_stage
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v", ".ts", ".mts", ".mpg", ".mpeg", ".flv"})
+_LIST_SUFFIXES = frozenset({".txt", ".lst", ".list", ".tsv"})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """One source video of a job."""
+
+    video_id: str
+    path: Path
+    leave_out_s: tuple[float, float] = (0.0, 0.0)
+    """Seconds at its start and at its end that no clip may touch (intro, credits)."""
+
+
+class Job:
+    """A job's folder with what ``job.yaml`` says; plans and receipts are read once until ``refresh``."""
+
+    def __init__(self, root: Path, config: Config, sources: Mapping[str, Source]) -> None:
+        self.root, self.config = root, config
+        self.sources: dict[str, Source] = dict(sorted(sources.items()))
+        self.selection_mode: str = "auto"
+        self._plans: dict[str, list[WorkItem]] = {}
+        self._receipts: dict[str, dict[str, Receipt]] = {}
+
+    def refresh(self) -> None:
+        """Forget plans and receipts: a stage has run, here or elsewhere."""
+        self._plans.clear()
+        self._receipts.clear()
+
+    def plan(self, stage: str) -> list[WorkItem]:
+        """The items of a stage.
+
+        Raises:
+            NotReadyError: the stage waits for all of an earlier one.
+        """
+        if stage not in self._plans:
+            self._plans[stage] = load_stage(stage).plan(self)
+        return self._plans[stage]
+
+    def receipts(self, stage: str) -> dict[str, Receipt]:
+        """The receipt that holds for each item of a stage."""
+        if stage not in self._receipts:
+            self._receipts[stage] = read_receipts(self.root, stage)
+        return self._receipts[stage]
+
+    def settled(self, stage: str) -> dict[str, Receipt]:
+        """Up-to-date receipts of a stage's planned items, whatever their state; failures to be retried included."""
+        known = self.receipts(stage)
+        states = {item.name: item_state(item, known.get(item.name), self.root) for item in self.plan(stage)}
+        return {name: known[name] for name, state in states.items() if state in ("current", "retry")}
+
+    def done(self, stage: str) -> dict[str, Receipt]:
+        """Up-to-date receipts of a stage's items that are done."""
+        return {name: receipt for name, receipt in self.settled(stage).items() if receipt.state == "done"}
+
+    def pending(self, stage: str) -> list[WorkItem]:
+        """Items of a stage that have no up-to-date receipt at all, in any part."""
+        settled = self.settled(stage)
+        return [item for item in self.plan(stage) if item.name not in settled]
+
+    def save(self) -> None:
+        """Write ``job.yaml``, if it would change.
+
+        Raises:
+            StorageError: the folder cannot be written to.
+        """
+        values = {
+            "config": self.config.model_dump(mode="json", exclude_defaults=True),
+            "videos": {name: _source_values(source) for name, source in self.sources.items()},
+        }
+        data = yaml.safe_dump(values, sort_keys=True, allow_unicode=True, width=120).encode()
+        path = self.root / "job.yaml"
+        if not (path.is_file() and path.read_bytes() == data):
+            atomic_write(path, data)
+
+
+def open_job(root: Path) -> Job:
+    """The job in a folder.
+
+    Raises:
+        ConfigError: there is none, or its ``job.yaml`` cannot be used.
+    """
+    path = root / "job.yaml"
+    if not path.is_file():
+        raise ConfigError(f"{root}: holds no job.yaml; make a job with `animatic label VIDEO... --out {root}`")
+    values = read_yaml(path)
+    sources = {
+        name: Source(
+            video_id=name,
+            path=Path(entry["path"]),
+            leave_out_s=_pair(entry.get("leave_out_s", (0, 0))),
+        )
+        for name, entry in (values.get("videos") or {}).items()
+    }
+    return Job(root, parse_config(values.get("config") or {}, str(path)), sources)
+
+
+def open_or_create(root: Path, *, config: Config | None, videos: Sequence[Source]) -> Job:
+    """The job in ``root`` with ``videos`` added and, where given, another configuration. Nothing is written yet.
+
+    Raises:
+        ConfigError: a video has the id of another one, or no job and no videos.
+    """
+    known = open_job(root) if (root / "job.yaml").is_file() else None
+    sources = dict(known.sources) if known else {}
+    for source in videos:
+        old = sources.get(source.video_id)
+        if old is not None and old.path != source.path and old.path.exists():
+            raise ConfigError(_same_id(source.video_id, old.path, source.path))
+        sources[source.video_id] = source
+    if not sources:
+        raise ConfigError(f"{root}: holds no job and no videos were given; name some VIDEO files or folders")
+    return Job(root, config or (known.config if known else Config()), sources)
+
+
+def find_videos(arguments: Sequence[Path], *, leave_out: Path | None = None) -> list[Source]:
+    """The source videos that a person named: files, folders (searched to their depths), text files of paths.
+
+    A line of a text file is a path, relative to that file, with an id before it if wanted: ``id<TAB>path``.
+
+    Raises:
+        ConfigError: nothing there, an id that cannot be used, two videos with one id, or none of them exists.
+    """
+    found = [entry for argument in arguments for entry in _expand(argument)]
+    sources: dict[str, Source] = {}
+    spans = read_leave_out(leave_out) if leave_out else {}
+    for video_id, path in found:
+        check_id(video_id, path)
+        old = sources.get(video_id)
+        if old is not None and old.path != path:
+            raise ConfigError(_same_id(video_id, old.path, path))
+        sources[video_id] = Source(video_id=video_id, path=path, leave_out_s=spans.get(video_id, (0.0, 0.0)))
+    if sources and not any(source.path.exists() for source in sources.values()):
+        missing = next(iter(sources.values())).path
+        raise ConfigError(f"{missing}: no such file; check the path")
+    unknown = sorted(set(spans) - set(sources))
+    if unknown:
+        raise ConfigError(
+            f"{leave_out}: names {unknown[0]!r}, which is none of the videos; use ids, as {_some(sources)}"
+        )
+    return list(sources.values())
+
+
+def check_id(video_id: str, path: Path) -> None:
+    """Raise ``ConfigError`` unless a video's id can be part of a clip's key."""
+    try:
+        check_video_id(video_id)
+    except Exception as error:
+        raise ConfigError(
+            f"{path}: {video_id!r} is no video id (letters, digits, - and _ only); rename the file, or give a text "
+            "file of lines `id<TAB>path` in its place"
+        ) from error
+
+
+def read_leave_out(path: Path) -> dict[str, tuple[float, float]]:
+    """Seconds to leave out at each video's start and end: a CSV table with the columns ``video_id, start_s, end_s``.
+
+    Raises:
+        ConfigError: it cannot be read, lacks a column, names a video twice, or holds something that is no length.
+    """
+    spans: dict[str, tuple[float, float]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            for number, row in enumerate(csv.DictReader(stream), start=2):
+                span = _pair((row["start_s"] or 0, row["end_s"] or 0))
+                if not all(0 <= value < math.inf for value in span) or row["video_id"] in spans:
+                    raise ValueError(f"line {number} repeats a video or is no length of time")
+                spans[row["video_id"]] = span
+    except KeyError as error:
+        raise ConfigError(f"{path}: has no column {error}; give video_id,start_s,end_s") from error
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        raise ConfigError(f"{path}: cannot be read as video_id,start_s,end_s ({error}); mend the table") from error
+    return spans
+
+
+def _pair(values: Sequence[Any]) -> tuple[float, float]:
+    start, end = values
+    return float(start), float(end)
+
+
+def _expand(argument: Path) -> list[tuple[str, Path]]:
+    if argument.is_dir():
+        files = sorted(path for path in argument.rglob("*") if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file())
+        if not files:
+            raise ConfigError(f"{argument}: holds no videos ({', '.join(sorted(VIDEO_SUFFIXES))}); check the path")
+        return [(path.stem, path.absolute()) for path in files]
+    if argument.suffix.lower() in _LIST_SUFFIXES and argument.is_file():
+        return _read_list(argument)
+    return [(argument.stem, argument.absolute())]
+
+
+def _read_list(path: Path) -> list[tuple[str, Path]]:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as a list of videos ({error}); give a path on each line") from error
+    entries = []
+    for line in lines:
+        video_id, tab, name = line.strip().rpartition("\t")
+        if not name.strip() or line.lstrip().startswith("#"):
+            continue
+        video = (path.parent / name.strip()).absolute()
+        entries.append((video_id.strip() if tab else video.stem, video))
+    if not entries:
+        raise ConfigError(f"{path}: lists no videos; give a path on each line")
+    return entries
+
+
+def _same_id(video_id: str, first: Path, second: Path) -> str:
+    return (
+        f"two videos would be called {video_id!r}: {first} and {second}; rename one, or give a text file of lines "
+        "`id<TAB>path` in their place"
+    )
+
+
+def _some(sources: Mapping[str, Source]) -> str:
+    return ", ".join(repr(name) for name in list(sources)[:3])
+
+
+def _source_values(source: Source) -> dict[str, Any]:
+    values: dict[str, Any] = {"path": str(source.path)}
+    if any(source.leave_out_s):
+        values["leave_out_s"] = list(source.leave_out_s)
+    return values
