@@ -1,0 +1,92 @@
+"""From a source's decoded frames to the constant-rate frames of a run, one at a time."""
+
+import av
+import cv2
+import numpy as np
+
+from labeling.conversion import FrameConverter, luma
+from labeling.encoding import VideoWriter
+from labeling.errors import VideoError
+from labeling.hard_cuts import find_hard_cuts, thumbnail
+from labeling.video import SAME_TIME_S, SourceFrame
+
+
+class RunEncoder:
+    """Shows each wanted source frame for as many grid frames as want it, and remembers what was lost."""
+
+    def __init__(self, wanted_s: np.ndarray, *, writer: VideoWriter, converter: FrameConverter) -> None:
+        """``wanted_s`` is (N,) float64, rising: the source time that each frame of the run shows."""
+        self._wanted_s = wanted_s
+        self._writer = writer
+        self._converter = converter
+        self._next = 0
+        self._shown: av.VideoFrame | None = None
+        self._thumbnails: list[np.ndarray] = []
+        self._thumbnail_of = np.zeros(len(wanted_s), dtype=np.int64)
+        self._bidirectional: list[int] = []
+        self.lost = np.zeros(len(wanted_s), dtype=bool)
+        """(N,) bool, frames whose source frame did not decode, or came out damaged."""
+
+    def show(self, frame: SourceFrame) -> None:
+        """Take the next decoded frame; it is converted and encoded only if the run wants it."""
+        start = self._next
+        first = start + int(np.searchsorted(self._wanted_s[start:], frame.time_s - SAME_TIME_S))
+        end = first + int(np.searchsorted(self._wanted_s[first:], frame.time_s + SAME_TIME_S))
+        self._mark(frame, first, end)
+        if end == first:
+            return
+        # What was wanted between the last frame and this one never came.
+        self.lost[start:first] = True
+        if self._shown is None:
+            self._convert(frame)
+            self._repeat(first - start)
+        else:
+            self._repeat(first - start)
+            self._convert(frame)
+        self._repeat(end - first)
+
+    def finish(self, source: object) -> None:
+        """Fill up the end with the last picture.
+
+        Raises:
+            VideoError: no frame of the run decoded.
+        """
+        if self._shown is None:
+            raise VideoError(
+                f"{source}: no frame between {self._wanted_s[0]:.3f} and {self._wanted_s[-1]:.3f} s decodes; "
+                "leave that part out"
+            )
+        self.lost[self._next :] = True
+        self._repeat(len(self._wanted_s) - self._next)
+
+    def cuts(self) -> np.ndarray:
+        """(N,) bool, first frames of new shots."""
+        of_pictures = find_hard_cuts(np.stack(self._thumbnails))
+        changed = np.concatenate([[False], np.diff(self._thumbnail_of) > 0])
+        return of_pictures[self._thumbnail_of] & changed
+
+    def _mark(self, frame: SourceFrame, first: int, end: int) -> None:
+        if not frame.is_clean:
+            # B-frames shown before a damaged frame may have been predicted from it.
+            self.lost[self._bidirectional] = True
+            self.lost[first:end] = True
+        if not frame.is_bidirectional:
+            self._bidirectional.clear()
+        else:
+            self._bidirectional.extend(range(first, end))
+
+    def _convert(self, frame: SourceFrame) -> None:
+        self._shown = self._converter.convert(frame.picture)
+        grey = luma(self._shown) if self._shown.format.name == "yuv420p" else _grey(self._shown)
+        self._thumbnails.append(thumbnail(grey))
+
+    def _repeat(self, times: int) -> None:
+        assert self._shown is not None
+        for _ in range(times):
+            self._writer.write_frame(self._shown)
+            self._thumbnail_of[self._next] = len(self._thumbnails) - 1
+            self._next += 1
+
+
+def _grey(picture: av.VideoFrame) -> np.ndarray:
+    return cv2.cvtColor(picture.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY)
