@@ -1,0 +1,79 @@
+"""Finding weights, and naming them by content."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from labeling.errors import ModelError
+
+_ADVICE = "give a local diffusers folder, a .safetensors file, or a hub id that this machine can reach"
+
+
+def load_pretrained(kind: Any, source: str, subfolder: str, *, dtype: torch.dtype) -> Any:
+    """A diffusers model from a folder or hub id (its ``subfolder``), or from a single-file checkpoint.
+
+    Args:
+        kind: the diffusers class.
+        source: folder, ``.safetensors`` file, or hub id.
+        subfolder: the model's part of a folder or hub repository.
+        dtype: of the weights in memory.
+
+    Raises:
+        ModelError: nothing there, or not this class's weights.
+    """
+    try:
+        if Path(source).is_file():
+            return kind.from_single_file(source, torch_dtype=dtype)
+        return kind.from_pretrained(source, subfolder=subfolder, torch_dtype=dtype, use_safetensors=True)
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise ModelError(
+            f"{kind.__name__} could not be loaded from {source!r} ({_first_line(error)}); {_ADVICE}"
+        ) from error
+
+
+def load_text_encoder(source: str, *, dtype: torch.dtype, single_file: bool = False) -> tuple[Any, torch.nn.Module]:
+    """(tokenizer, T5 encoder) from the ``tokenizer`` and ``text_encoder`` parts of a folder or hub id, or its root.
+
+    Raises:
+        ModelError: a single file, which holds no text encoder, or nothing there.
+    """
+    from transformers import AutoTokenizer, T5EncoderModel
+
+    if single_file and Path(source).is_file():
+        raise ModelError(f"{source} holds no text encoder; set backbone.text_weights to a T5 folder or hub id")
+    folder = Path(source)
+    split = not folder.is_dir() or (folder / "text_encoder").is_dir()
+    parts = ("tokenizer", "text_encoder") if split and "t5" not in folder.name else ("", "")
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(source, subfolder=parts[0])
+        encoder = T5EncoderModel.from_pretrained(source, subfolder=parts[1], dtype=dtype)
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise ModelError(f"no T5 text encoder in {source!r} ({_first_line(error)}); {_ADVICE}") from error
+    return tokenizer, encoder
+
+
+def digest_tensors(tensors: Mapping[str, torch.Tensor], *, extra: Any = None) -> str:
+    """sha256 over names, types, shapes and bytes of tensors, and over ``extra`` as JSON."""
+    digest = hashlib.sha256(json.dumps(extra, sort_keys=True, default=str).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        digest.update(f"{name}:{tensor.dtype}:{tuple(tensor.shape)}".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+def digest_module(module: torch.nn.Module, *, extra: Mapping[str, Any] | None = None) -> str:
+    """sha256 of a network's weights and its configuration; where it was loaded from does not count."""
+    config = getattr(module, "config", {})
+    settings = config.to_dict() if hasattr(config, "to_dict") else dict(config)
+    settings = {key: value for key, value in settings.items() if not key.startswith("_") and "version" not in key}
+    return digest_tensors(module.state_dict(), extra={"config": settings, **(extra or {})})
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
