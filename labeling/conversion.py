@@ -104,7 +104,7 @@ def tag_bt709(frame: av.VideoFrame | av.VideoCodecContext) -> None:
 def luma(frame: av.VideoFrame) -> np.ndarray:
     """(H, W) uint8 view of a planar frame's first plane; nothing is copied."""
     plane = frame.planes[0]
-    return np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width]
+    return np.frombuffer(memoryview(plane), np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width]
 
 
 def deinterlaced(frames: Iterable[av.VideoFrame]) -> Iterator[av.VideoFrame]:

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Literal, Self
 
 import av
+import av.container
 import av.error
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -29,13 +30,13 @@ class EncoderSettings(BaseModel):
 
     codec: Codec = "libx264"
     """``libx264`` is YUV 4:2:0; ``libx264rgb`` keeps full-resolution RGB."""
-    crf: int = Field(18, ge=0, le=51)
+    crf: int = Field(default=18, ge=0, le=51)
     """Constant rate factor; 0 is lossless."""
     preset: Preset = "veryfast"
-    threads: int = Field(1, ge=1, le=64)
-    gop: int = Field(24, ge=1, le=600)
+    threads: int = Field(default=1, ge=1, le=64)
+    gop: int = Field(default=24, ge=1, le=600)
     """Frames from one keyframe to the next; clips start on keyframes, so strides are multiples of it."""
-    b_frames: int = Field(3, ge=0, le=16)
+    b_frames: int = Field(default=3, ge=0, le=16)
     """Most B-frames in a row."""
 
 

@@ -66,11 +66,11 @@ class ClipSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    clip_frames: int = Field(121, ge=1)
+    clip_frames: int = Field(default=121, ge=1)
     """121 frames are 5 s; LTX's VAE takes 8k+1."""
-    stride_frames: int = Field(48, ge=1)
+    stride_frames: int = Field(default=48, ge=1)
     """Frames from one clip's start to the next, a multiple of the GOP."""
-    run_frames: int = Field(1440, ge=1)
+    run_frames: int = Field(default=1440, ge=1)
     """Clips that start within the same stretch of this length share a run."""
 
 

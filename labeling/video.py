@@ -12,16 +12,18 @@ from itertools import chain
 from pathlib import Path
 
 import av
+import av.container
 import av.error
 import numpy as np
-from av.stream import Discard, Disposition
 
 from labeling.camera import PictureMap
 from labeling.conversion import FrameConverter, OutputPicture, colour_matrix, deinterlaced, is_full_range
 from labeling.encoding import EncoderSettings, VideoWriter, copy_packets, lossless_rgb
 from labeling.errors import VideoError
+from labeling.sources import SAME_TIME_S, open_video, pick_video_stream, read_packets, read_packets_from, seconds
 
 __all__ = [
+    "SAME_TIME_S",
     "DecodedFrame",
     "EncoderSettings",
     "PacketTimes",
@@ -39,13 +41,8 @@ __all__ = [
     "source_frames",
 ]
 
-SAME_TIME_S = 1e-6
-"""Two times closer than this are the same frame's."""
 _B_FRAME = 3
-_MOST_DEMUX_ERRORS = 100
 _PROBED_FRAMES = 3
-# Half a second, and then ever further back, to find a keyframe that is really before the wanted frame.
-_SEEK_BACK_S = (0.0, 0.5, 2.0, 8.0, 32.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,9 +120,12 @@ def probe(path: Path) -> VideoInfo:
             can be decoded; the message says which.
     """
     path = Path(path)
-    with _open(path) as container:
-        stream = _video_stream(container, path)
-        pictures = [frame.picture for frame, _ in zip(_decode(container, stream), range(_PROBED_FRAMES), strict=False)]
+    with open_video(path) as container:
+        stream = pick_video_stream(container, path)
+        pictures = [
+            frame.picture
+            for frame, _ in zip(_decode(stream, read_packets(container, stream)), range(_PROBED_FRAMES), strict=False)
+        ]
         if not pictures:
             raise VideoError(f"{path}: not one frame can be decoded ({stream.codec.name}); get the file again")
         return _video_info(path, container, stream, pictures)
@@ -140,16 +140,16 @@ def read_packet_times(path: Path) -> PacketTimes:
     path = Path(path)
     times: dict[float, bool] = {}
     broken = untimed = 0
-    with _open(path) as container:
-        stream = _video_stream(container, path)
-        for packet in _packets(container, stream):
+    with open_video(path) as container:
+        stream = pick_video_stream(container, path)
+        for packet in read_packets(container, stream):
             if packet is None or packet.is_corrupt:
                 broken += 1
             elif packet.size and not packet.is_discard:
                 if packet.pts is None:
                     untimed += 1
                 else:
-                    times[_seconds(packet.pts, packet.time_base)] = packet.is_keyframe
+                    times[seconds(packet.pts, packet.time_base)] = packet.is_keyframe
         broken = max(broken, stream.frames - len(times) - untimed)
     if untimed > len(times):
         raise VideoError(
@@ -175,11 +175,11 @@ def source_frames(
         VideoError: as ``probe``.
     """
     path = Path(path)
-    with _open(path) as container:
-        stream = _video_stream(container, path)
+    with open_video(path) as container:
+        stream = pick_video_stream(container, path)
         stream.thread_count = threads
-        packets = _packets_from(container, stream, start_s)
-        frames = _decode(container, stream, packets)
+        packets = read_packets_from(container, stream, start_s)
+        frames = _decode(stream, packets)
         shown = _deinterlaced(frames) if deinterlace else frames
         for frame in shown:
             if frame.time_s >= end_s - SAME_TIME_S:
@@ -213,8 +213,8 @@ def decode_at(path: Path, times_s: Sequence[float], *, picture: PictureMap | Non
         VideoError: as ``probe``.
     """
     converter = _rgb_converter(probe(path), picture)
-    with _open(Path(path)) as container:
-        stream = _video_stream(container, Path(path))
+    with open_video(Path(path)) as container:
+        stream = pick_video_stream(container, Path(path))
         for time_s in times_s:
             frame = _frame_at(container, stream, float(time_s))
             if frame is not None:
@@ -234,15 +234,15 @@ def read_frames(path: Path, *, start: int = 0, end: int | None = None) -> Iterat
     end = count if end is None else end
     if not 0 <= start <= end <= count:
         raise VideoError(f"{path}: has {count} frames, asked for [{start}, {end}); check the span")
-    with _open(path) as container:
-        stream = _video_stream(container, path)
+    with open_video(path) as container:
+        stream = pick_video_stream(container, path)
         rate = stream.average_rate or Fraction(24)
         first = float(Fraction(start) / rate)
         shown = 0
         converter = FrameConverter(
             OutputPicture.whole(stream.width, stream.height, rotation_deg=0, pixel_format="rgb24")
         )  # fmt: skip
-        for frame in _decode(container, stream, _packets_from(container, stream, first)):
+        for frame in _decode(stream, read_packets_from(container, stream, first)):
             index = round(frame.time_s * rate)
             if index >= end:
                 break
@@ -259,8 +259,8 @@ def frame_count(path: Path) -> int:
     Raises:
         VideoError: as ``probe``.
     """
-    with _open(Path(path)) as container:
-        return _video_stream(container, Path(path)).frames
+    with open_video(Path(path)) as container:
+        return pick_video_stream(container, Path(path)).frames
 
 
 def _rgb_converter(info: VideoInfo, picture: PictureMap | None) -> FrameConverter:
@@ -269,64 +269,6 @@ def _rgb_converter(info: VideoInfo, picture: PictureMap | None) -> FrameConverte
     else:
         output = OutputPicture.of_map(picture, rotation_deg=info.rotation_deg, pixel_format="rgb24")
     return FrameConverter(output)
-
-
-def _open(path: Path) -> av.container.InputContainer:
-    if not path.exists():
-        raise VideoError(f"{path}: no such file; check the path")
-    if path.is_dir():
-        raise VideoError(f"{path}: is a folder; give a video file")
-    if path.stat().st_size == 0:
-        raise VideoError(f"{path}: is empty (0 bytes); get the file again")
-    try:
-        return av.open(str(path))
-    except (av.error.FFmpegError, OSError) as error:
-        raise VideoError(_why_unreadable(path, error)) from error
-
-
-def _why_unreadable(path: Path, error: Exception) -> str:
-    if isinstance(error, PermissionError):
-        return f"{path}: may not be read ({error.strerror}); change its permissions"
-    boxes = _mp4_boxes(path)
-    if "ftyp" in boxes and "moov" not in boxes:
-        return (
-            f"{path}: is an MP4 without its index (no moov box: found {', '.join(boxes)}); the recording or the copy "
-            "was cut off, get the file again"
-        )
-    return f"{path}: is not a video that can be read ({error.__class__.__name__}); check what the file is"
-
-
-def _mp4_boxes(path: Path) -> list[str]:
-    """Names of the top-level boxes, as far as they can be followed."""
-    names: list[str] = []
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        at = 0
-        while at + 8 <= size and len(names) < 64:
-            file.seek(at)
-            header = file.read(16)
-            length = int.from_bytes(header[:4], "big")
-            if length == 1:
-                length = int.from_bytes(header[8:16], "big")
-            if not header[4:8].isalnum() or (length < 8 and length != 0):
-                break
-            names.append(header[4:8].decode("ascii", "replace"))
-            at = at + length if length else size
-    return names
-
-
-def _video_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
-    streams = [stream for stream in container.streams.video if not stream.disposition & Disposition.attached_pic]
-    if not streams:
-        kinds = sorted({stream.type for stream in container.streams})
-        raise VideoError(f"{path}: has no video stream, only {', '.join(kinds) or 'nothing'}; give a video file")
-    if streams[0].codec_context is None:
-        raise VideoError(f"{path}: its codec is not known here; convert it to H.264 first")
-    chosen = streams[0]
-    for stream in container.streams:
-        if stream.index != chosen.index:
-            stream.discard = Discard.all
-    return chosen
 
 
 def _video_info(
@@ -358,57 +300,11 @@ def _upright_turn_deg(frame: av.VideoFrame) -> int:
     return round(-frame.rotation / 90) * 90 % 360
 
 
-def _seconds(pts: int, time_base: Fraction) -> float:
-    return pts * time_base.numerator / time_base.denominator
-
-
-def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.Packet | None]:
-    """Packets, with None wherever the file could not be read; ends with the empty packet that flushes a decoder."""
-    errors = 0
-    while True:
-        try:
-            for packet in container.demux(stream):
-                errors = 0
-                yield packet
-            return
-        except av.error.FFmpegError:
-            errors += 1
-            if errors > _MOST_DEMUX_ERRORS:
-                return
-            yield None
-
-
-def _packets_from(
-    container: av.container.InputContainer, stream: av.VideoStream, start_s: float
-) -> Iterator[av.Packet | None]:
-    """Packets from a keyframe that is shown at or before ``start_s``; from the first if there is none."""
-    for back_s in _SEEK_BACK_S if math.isfinite(start_s) and stream.time_base else ():
-        try:
-            container.seek(math.floor((start_s - back_s) / stream.time_base + 0.5), stream=stream)
-        except av.error.FFmpegError:
-            continue
-        packets = _packets(container, stream)
-        for packet in packets:
-            if packet is not None and packet.is_keyframe and packet.pts is not None:
-                if _seconds(packet.pts, packet.time_base) <= start_s + SAME_TIME_S:
-                    return chain([packet], packets)
-                break
-    try:
-        container.seek(-(2**62), stream=stream)
-    except av.error.FFmpegError:
-        container.seek(0)
-    return _packets(container, stream)
-
-
-def _decode(
-    container: av.container.InputContainer,
-    stream: av.VideoStream,
-    packets: Iterable[av.Packet | None] | None = None,
-) -> Iterator[SourceFrame]:
+def _decode(stream: av.VideoStream, packets: Iterable[av.Packet | None]) -> Iterator[SourceFrame]:
     """Frames in the order they are shown. After an error, frames are unclean up to the next keyframe shown after it."""
     broken_at_s = -math.inf
     clean = True
-    for packet in _packets(container, stream) if packets is None else packets:
+    for packet in packets:
         pictures: list[av.VideoFrame] = []
         try:
             if packet is not None:
@@ -418,11 +314,11 @@ def _decode(
         if packet is None or packet.is_corrupt:
             clean = False
         if not clean and packet is not None and packet.pts is not None and not pictures:
-            broken_at_s = max(broken_at_s, _seconds(packet.pts, packet.time_base))
+            broken_at_s = max(broken_at_s, seconds(packet.pts, packet.time_base))
         for picture in pictures:
             if picture.pts is None or picture.time_base is None:
                 continue
-            time_s = _seconds(picture.pts, picture.time_base)
+            time_s = seconds(picture.pts, picture.time_base)
             if picture.is_corrupt:
                 clean = False
             elif picture.key_frame and time_s > broken_at_s:
@@ -451,14 +347,14 @@ def _deinterlaced(frames: Iterator[SourceFrame]) -> Iterator[SourceFrame]:
 
 
 def _frame_at(container: av.container.InputContainer, stream: av.VideoStream, time_s: float) -> SourceFrame | None:
-    packets = _packets_from(container, stream, time_s)
+    packets = read_packets_from(container, stream, time_s)
     first = next(iter(packets), None)
     if first is None:
         return None
     whole = not first.is_corrupt and first.is_keyframe and first.pts is not None
-    if whole and abs(_seconds(first.pts or 0, first.time_base) - time_s) < SAME_TIME_S:
+    if whole and abs(seconds(first.pts or 0, first.time_base) - time_s) < SAME_TIME_S:
         return _lone_keyframe(stream, first, time_s)
-    for frame in _decode(container, stream, chain([first], packets)):
+    for frame in _decode(stream, chain([first], packets)):
         if frame.time_s >= time_s - SAME_TIME_S:
             return frame if frame.time_s <= time_s + SAME_TIME_S else None
     return None
