@@ -1,0 +1,214 @@
+"""Batches for each street model: pool pictures, moved and disturbed, with the targets that belong to them."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+
+from labeling.detection import LETTERBOX_GREY
+from labeling.model_cards import IMAGENET_MEAN, IMAGENET_STD
+from labeling.schemas import Category, KeypointSchema, keypoint_schema
+from training.street_augment import AugmentSettings, disturb, map_boxes, map_points, random_map
+from training.street_networks import FIELD_STRIDE
+from training.street_pool import ObjectTruth, PoolCrop, StreetPool
+from training.street_targets import encode_boxes, encode_fields, encode_responses
+
+CLASSES: tuple[Category, ...] = ("car", "person")
+CROP_PADDING = 1.25
+LEAST_SHARE = 0.15
+"""Objects of which less is visible are left out of the detector's loss: neither asked for nor forbidden."""
+_LEAST_WINDOW_PX = 5.0
+_HIDDEN_WEIGHT = 0.25
+_FOUND_WITHIN = 0.1
+"""Of the box diagonal: what PCK@0.1 calls right."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Batch:
+    """Network input and whatever the loss needs beside it."""
+
+    pictures: torch.Tensor
+    """(N, 3, H, W) float32, normalised as the card says, channels last in memory."""
+    targets: tuple[torch.Tensor, ...]
+
+
+def to_input(pictures: list[np.ndarray], normalisation: Literal["imagenet", "bgr255"]) -> torch.Tensor:
+    """(h, w, 3) uint8 RGB pictures as one normalised batch."""
+    batch = torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2)
+    if normalisation == "bgr255":
+        return batch.flip(1).float().contiguous(memory_format=torch.channels_last)
+    mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
+    return ((batch.float() - mean) / std).contiguous(memory_format=torch.channels_last)
+
+
+def mirror_order(table: KeypointSchema) -> np.ndarray:
+    """(K,) for each point the one that takes its place in a mirrored picture: left and right change their names."""
+
+    def mirrored(name: str) -> str:
+        swap = {"left": "right", "right": "left"}
+        return "_".join(swap.get(part, part) for part in name.split("_"))
+
+    return np.array([table.point_names.index(mirrored(name)) for name in table.point_names])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectorBatches:
+    """Windows of half-size frames with grid targets."""
+
+    pool: StreetPool
+    size: tuple[int, int]
+    """Width and height of a window, multiples of 32."""
+    count: int
+    augment: AugmentSettings
+    scales: tuple[float, float] = (0.7, 1.35)
+
+    def __call__(self, rng: np.random.Generator) -> Batch:
+        """One batch: targets are classes (N, A) and boxes (N, A, 4)."""
+        pictures, classes, boxes = [], [], []
+        for index in rng.integers(0, len(self.pool.frames), self.count):
+            frame = self.pool.frames[index]
+            height, width = frame.half.shape[:2]
+            half_to_window = random_map(
+                rng, source=(width, height), target=self.size, scales=self.scales, flip=rng.random() < 0.5
+            )
+            grey = (LETTERBOX_GREY,) * 3
+            window = cv2.warpAffine(disturb(frame.half, rng, self.augment), half_to_window, self.size, borderValue=grey)
+            found = [truth for truth in frame.objects if truth.category in CLASSES]
+            inside, labels, counted = self._boxes(found, half_to_window)
+            targets = encode_boxes(inside, labels, counted, width=self.size[0], height=self.size[1])
+            pictures.append(window)
+            classes.append(targets.classes)
+            boxes.append(targets.boxes_xyxy)
+        targets = (torch.from_numpy(np.stack(classes)), torch.from_numpy(np.stack(boxes)))
+        return Batch(pictures=to_input(pictures, "bgr255"), targets=targets)
+
+    def _boxes(self, found: list[ObjectTruth], half_to_window: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if not found:
+            return np.zeros((0, 4), np.float32), np.zeros(0, np.int64), np.zeros(0, bool)
+        whole = map_boxes(np.stack([truth.box_xyxy for truth in found]) / 2, half_to_window)
+        inside = np.clip(whole, 0, np.tile(self.size, 2))
+        sides, whole_sides = inside[:, 2:] - inside[:, :2], whole[:, 2:] - whole[:, :2]
+        left = np.prod(sides, axis=1) / np.maximum(np.prod(whole_sides, axis=1), 1e-6)
+        shares = left * np.array([truth.visible_share for truth in found])
+        labels = np.array([CLASSES.index(truth.category) for truth in found])
+        touching = (sides > 1).all(axis=1)
+        counted = (shares >= LEAST_SHARE) & (sides[:, 1] >= _LEAST_WINDOW_PX) & touching
+        return inside[touching].astype(np.float32), labels[touching], counted[touching]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CropBatches:
+    """Crops around jittered boxes with SimCC targets."""
+
+    crops: tuple[PoolCrop, ...]
+    schema: str
+    size: tuple[int, int]
+    """Width and height of the network's input."""
+    count: int
+    augment: AugmentSettings
+
+    def __call__(self, rng: np.random.Generator) -> Batch:
+        """One batch: targets are responses along x and y, weights, visibility, and the tolerance in bins."""
+        order = mirror_order(keypoint_schema(self.schema))
+        pictures, points, visible, tolerances = [], [], [], []
+        for index in rng.integers(0, len(self.crops), self.count):
+            crop, flip = self.crops[index], bool(rng.random() < 0.5)
+            crop_to_input, scale = self._map(crop, rng, flip)
+            picture = cv2.warpAffine(crop.picture, crop_to_input, self.size, flags=cv2.INTER_LINEAR)
+            pictures.append(disturb(picture, rng, self.augment))
+            chosen = order if flip else slice(None)
+            points.append(map_points(crop.truth.points_xy[chosen], crop_to_input))
+            visible.append(crop.truth.visible[chosen])
+            sides = crop.truth.box_xyxy[2:] - crop.truth.box_xyxy[:2]
+            tolerances.append(_FOUND_WITHIN * 2 * scale * float(np.hypot(*sides)))
+        return Batch(pictures=to_input(pictures, "imagenet"), targets=self._targets(points, visible, tolerances))
+
+    def _map(self, crop: PoolCrop, rng: np.random.Generator, flip: bool) -> tuple[np.ndarray, float]:
+        box = crop.truth.box_xyxy
+        sides = (box[2:] - box[:2]) * rng.uniform(0.9, 1.12, 2)
+        centre = (box[:2] + box[2:]) / 2 + (box[2:] - box[:2]) * rng.uniform(-0.07, 0.07, 2)
+        aspect = self.size[0] / self.size[1]
+        width = CROP_PADDING * max(sides[0], sides[1] * aspect)
+        scale = self.size[0] / width
+        angle = np.radians(rng.uniform(-4, 4))
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        linear = scale * turn @ np.diag([-1.0 if flip else 1.0, 1.0])
+        return np.column_stack([linear, np.array(self.size) / 2 - linear @ centre]), scale
+
+    def _targets(
+        self, points: list[np.ndarray], visible: list[np.ndarray], tolerances: list[float]
+    ) -> tuple[torch.Tensor, ...]:
+        places, seen = np.stack(points), np.stack(visible)
+        inside = ((places >= 0) & (places < np.array(self.size))).all(axis=2)
+        seen &= inside
+        along_x, along_y = encode_responses(places, self.size)
+        weights = np.where(seen, 1.0, _HIDDEN_WEIGHT * inside).astype(np.float32)
+        arrays = (along_x, along_y, weights, seen.astype(np.float32), np.array(tolerances, np.float32))
+        return tuple(torch.from_numpy(array) for array in arrays)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldBatches:
+    """Whole half-size frames with composite fields of one or more schemas."""
+
+    pool: StreetPool
+    schemas: tuple[str, ...]
+    size: tuple[int, int]
+    """Width and height of the network's input, multiples of the stride plus 1."""
+    count: int
+    augment: AugmentSettings
+    scales: tuple[float, float] = (0.9, 1.2)
+
+    def __call__(self, rng: np.random.Generator) -> Batch:
+        """One batch: targets are cif and caf of each schema in turn."""
+        pictures: list[np.ndarray] = []
+        targets: list[list[np.ndarray]] = []
+        for index in rng.integers(0, len(self.pool.frames), self.count):
+            frame, flip = self.pool.frames[index], bool(rng.random() < 0.5)
+            height, width = frame.half.shape[:2]
+            half_to_input = random_map(
+                rng, source=(width, height), target=self.size, scales=self.scales, flip=flip, rotation_deg=2.0
+            )
+            disturbed = disturb(frame.half, rng, self.augment)
+            pictures.append(cv2.warpAffine(disturbed, half_to_input, self.size, flags=cv2.INTER_LINEAR))
+            targets.append(self._fields(frame.objects, half_to_input, flip))
+        stacked = tuple(torch.from_numpy(np.stack(field)) for field in zip(*targets, strict=True))
+        return Batch(pictures=to_input(pictures, "imagenet"), targets=stacked)
+
+    def _fields(self, objects: tuple[ObjectTruth, ...], half_to_input: np.ndarray, flip: bool) -> list[np.ndarray]:
+        fields: list[np.ndarray] = []
+        for name in self.schemas:
+            table = keypoint_schema(name)
+            placed = [
+                field_object(truth, table, half_to_input, size=self.size, flip=flip)
+                for truth in sorted(objects, key=lambda truth: truth.box_xyxy[3])
+                if truth.category == table.category
+            ]
+            columns, rows = ((side - 1) // FIELD_STRIDE + 1 for side in self.size)
+            encoded = encode_fields(placed, table, columns=columns, rows=rows, stride=FIELD_STRIDE)
+            fields += [encoded.cif, encoded.caf]
+        return fields
+
+
+def field_object(
+    truth: ObjectTruth, table: KeypointSchema, half_to_input: np.ndarray, *, size: tuple[int, int], flip: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points in input pixels, which of them are there, and their scales, as ``encode_fields`` takes them.
+
+    A lane goes on behind a car: its hidden points are asked for. A car's are not.
+    """
+    points = map_points(truth.points_xy / 2, half_to_input)
+    there = truth.visible
+    if table.category == "lane":
+        steps = np.hypot(*np.diff(points, axis=0).T)
+        scales = np.clip(0.25 * np.minimum(np.append(steps, steps[-1]), np.append(steps[0], steps)), 4, 12)
+        there = np.isfinite(points).all(axis=1)
+    else:
+        order = mirror_order(table) if flip else slice(None)
+        points, there = points[order], there[order]
+        sides = truth.box_xyxy[2:] - truth.box_xyxy[:2]
+        scales = np.full(len(points), np.clip(0.04 * float(np.hypot(*sides)) / 2, 2, 12))
+    inside = ((points >= 0) & (points < np.array(size))).all(axis=1)
+    return points, np.logical_and(there, inside), scales

@@ -1,0 +1,100 @@
+"""Losses of the street models, scalars averaged over a batch. Shape suffixes as in ``street_networks``."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+_IGNORED = -2
+
+
+def detector_loss(rows: Tensor, classes: Tensor, boxes_xyxy: Tensor, cells: Tensor, strides: Tensor) -> Tensor:
+    """Overlap, objectness and class losses of a grid detector (Ge et al. 2021, with fixed assignment).
+
+    Args:
+        rows: (N, A, 5 + C) as ``StreetDetector`` gives them.
+        classes: (N, A) int64 as in ``GridTargets``.
+        boxes_xyxy: (N, A, 4) input pixels.
+        cells: (A, 2) column and row of each cell.
+        strides: (A,) pixels per cell.
+    """
+    positive = classes >= 0
+    count = positive.sum().clamp(min=1)
+    sample, cell = positive.nonzero(as_tuple=True)
+    picked, truth = rows[sample, cell], boxes_xyxy[sample, cell]
+    centres = (picked[:, :2] + cells[cell]) * strides[cell, None]
+    halves = picked[:, 2:4].clamp(max=5).exp() * strides[cell, None] / 2
+    overlap, generalised = _overlaps(torch.cat([centres - halves, centres + halves], dim=1), truth)
+    objectness = torch.zeros_like(rows[..., 4])
+    # The overlap is the score that suppression ranks by: the best placed of an object's cells survives.
+    objectness[sample, cell] = overlap.detach().clamp(min=0.3)
+    entropy = functional.binary_cross_entropy_with_logits(rows[..., 4], objectness, reduction="none")
+    entropy = (entropy * (classes != _IGNORED)).sum() / count
+    names = functional.one_hot(classes[sample, cell], rows.shape[2] - 5).float()
+    naming = functional.binary_cross_entropy_with_logits(picked[:, 5:], names, reduction="sum") / count
+    return 3 * (1 - generalised).sum() / count + entropy + 0.5 * naming
+
+
+def _overlaps(boxes: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Intersection over union of pairs, and its generalised form (Rezatofighi et al. 2019)."""
+    inner = torch.minimum(boxes[:, 2:], truth[:, 2:]) - torch.maximum(boxes[:, :2], truth[:, :2])
+    outer = torch.maximum(boxes[:, 2:], truth[:, 2:]) - torch.minimum(boxes[:, :2], truth[:, :2])
+    shared = inner.clamp(min=0).prod(dim=1)
+    union = (boxes[:, 2:] - boxes[:, :2]).prod(dim=1) + (truth[:, 2:] - truth[:, :2]).prod(dim=1) - shared
+    overlap = shared / union.clamp(min=1e-6)
+    hull = outer.prod(dim=1).clamp(min=1e-6)
+    return overlap, overlap - (hull - union) / hull
+
+
+def simcc_loss(
+    outputs: tuple[Tensor, Tensor, Tensor],
+    responses: tuple[Tensor, Tensor],
+    weights: Tensor,
+    visible: Tensor,
+    tolerance_bins: Tensor,
+) -> Tensor:
+    """Cross-entropy along each axis, and of the score: the probability that a point is seen *and* found.
+
+    Args:
+        outputs: logits (N, K, 2 W), (N, K, 2 H) and (N, K) as ``SimccNetwork`` gives them.
+        responses: (N, K, 2 W) and (N, K, 2 H), rows that sum to 1.
+        weights: (N, K) of the points' places: 1 visible, less where hidden, 0 where unknown.
+        visible: (N, K) 0 or 1.
+        tolerance_bins: (N,) distance within which a point counts as found.
+    """
+    total = weights.sum().clamp(min=1)
+    loss = torch.zeros(())
+    off = []
+    for logits, response in zip(outputs[:2], responses, strict=True):
+        loss = loss - ((response * logits.log_softmax(dim=2)).sum(dim=2) * weights).sum() / total
+        off.append(logits.detach().argmax(dim=2) - response.argmax(dim=2))
+    found = torch.hypot(off[0].float(), off[1].float()) <= tolerance_bins[:, None]
+    score = functional.binary_cross_entropy_with_logits(outputs[2], visible * found)
+    return loss + 2 * score
+
+
+def field_loss(cif: Tensor, caf: Tensor, cif_truth: Tensor, caf_truth: Tensor) -> Tensor:
+    """Focal loss of the confidences, smooth L1 of offsets and scales where there is something.
+
+    Args:
+        cif: (N, K, 4, h, w) as ``FieldNetwork`` gives it; cif_truth as in ``FieldTargets``.
+        caf: (N, E, 7, h, w).
+        cif_truth: (N, K, 4, h, w).
+        caf_truth: (N, E, 7, h, w).
+    """
+    return _one_field(cif, cif_truth, vectors=1) + _one_field(caf, caf_truth, vectors=2)
+
+
+def _one_field(field: Tensor, truth: Tensor, *, vectors: int) -> Tensor:
+    confidence, target = field[:, :, 0], truth[:, :, 0]
+    positive = target > 0
+    count = positive.sum().clamp(min=1)
+    entropy = functional.binary_cross_entropy_with_logits(confidence, target.clamp(min=0), reduction="none")
+    # Lin et al. 2017 with gamma 1: easy background is nearly all there is.
+    entropy = entropy * (1 - (-entropy).exp()) * (target >= 0)
+    sample, row, y, x = positive.nonzero(as_tuple=True)
+    values = field.permute(0, 1, 3, 4, 2)[sample, row, y, x]
+    wanted = truth.permute(0, 1, 3, 4, 2)[sample, row, y, x]
+    split = 1 + 2 * vectors
+    offsets = functional.smooth_l1_loss(values[:, 1:split], wanted[:, 1:split], beta=0.1, reduction="sum")
+    scales = functional.l1_loss(values[:, split:], wanted[:, split:], reduction="sum")
+    return 4 * entropy.sum() / count + (offsets + 0.2 * scales) / (vectors * count)

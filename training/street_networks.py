@@ -1,0 +1,210 @@
+"""The small networks behind the shipped street models, and the graphs that give their outputs by contract.
+
+Each network returns logits for the loss; its ``...Graph`` wraps it into what the model cards promise (DESIGN, *Model
+cards*). Shape suffixes: N pictures, A grid cells of all strides, C classes, K points, E edges, h x w field cells.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from labeling.schemas import keypoint_schema
+
+DETECTOR_STRIDES = (8, 16, 32)
+FIELD_STRIDE = 8
+_MAX_LOG_SIZE = 5.0
+
+
+def conv_unit(inputs: int, outputs: int, *, stride: int = 1, kernel: int = 3) -> nn.Sequential:
+    """Convolution, batch norm and ReLU; with stride 2, output cell i is centred on input pixel 2 i."""
+    convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+
+
+class ResidualUnit(nn.Module):
+    """Two 3x3 convolutions around a shortcut (He et al. 2016)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = conv_unit(width, width)
+        self.second = nn.Sequential(nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(N, width, h, w) to the same shape."""
+        return functional.relu(x + self.second(self.first(x)))
+
+
+class Trunk(nn.Module):
+    """Stages at strides 2, 4, 8, ...; each halves the picture, then refines it with residual units."""
+
+    def __init__(self, widths: Sequence[int], depths: Sequence[int]) -> None:
+        super().__init__()
+        stages, inputs = [], 3
+        for width, depth in zip(widths, depths, strict=True):
+            units = [conv_unit(inputs, width, stride=2), *(ResidualUnit(width) for _ in range(depth))]
+            stages.append(nn.Sequential(*units))
+            inputs = width
+        self.stages = nn.ModuleList(stages)
+
+    def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
+        """Features of every stage from stride 8 on."""
+        features = []
+        for index, stage in enumerate(self.stages):
+            x = stage(x)
+            if index >= 2:
+                features.append(x)
+        return features
+
+
+class Pyramid(nn.Module):
+    """Coarse features handed down to finer ones (Lin et al. 2017), all of one width."""
+
+    def __init__(self, inputs: Sequence[int], width: int) -> None:
+        super().__init__()
+        self.laterals = nn.ModuleList(conv_unit(size, width, kernel=1) for size in inputs)
+        self.smooth = nn.ModuleList(conv_unit(width, width) for _ in inputs[:-1])
+
+    def forward(self, features: list[torch.Tensor]) -> list[torch.Tensor]:
+        """One feature map of the pyramid's width per input, finest first."""
+        merged = [self.laterals[-1](features[-1])]
+        for index in range(len(features) - 2, -1, -1):
+            fine = self.laterals[index](features[index])
+            coarse = functional.interpolate(merged[0], scale_factor=2.0, mode="nearest")
+            # A field picture is 16 k + 1 wide: its coarse map overhangs by one cell.
+            merged.insert(0, self.smooth[index](fine + coarse[..., : fine.shape[-2], : fine.shape[-1]]))
+        return merged
+
+
+class StreetDetector(nn.Module):
+    """A YOLOX-like detector: one prediction per cell of strides 8, 16 and 32, one head shared by all of them."""
+
+    def __init__(self, classes: int, *, widths: Sequence[int] = (16, 24, 40, 72, 112), width: int = 48) -> None:
+        super().__init__()
+        self.trunk = Trunk(widths, (0, 0, 1, 1, 1))
+        self.pyramid = Pyramid(widths[2:], width)
+        self.tower = nn.ModuleList(conv_unit(width, width) for _ in DETECTOR_STRIDES)
+        self.head = nn.Conv2d(width, 5 + classes, 1)
+        # A cell holds an object about once in a hundred (Lin et al. 2017, focal loss).
+        nn.init.constant_(self.head.bias[4:5], -4.6)  # type: ignore[index]
+
+    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+        """(N, 3, H, W) BGR 0 to 255 to (N, A, 5 + C): offset x, y, log size w, h, then logits."""
+        features = self.pyramid(self.trunk(pictures / 64.0 - 2.0))
+        rows = [self.head(tower(x)).flatten(2) for tower, x in zip(self.tower, features, strict=True)]
+        return torch.cat(rows, dim=2).transpose(1, 2)
+
+
+class DetectorGraph(nn.Module):
+    """``StreetDetector`` as the ``yolox`` contract wants it: probabilities for objectness and classes."""
+
+    def __init__(self, network: StreetDetector) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+        """``output`` (N, A, 5 + C)."""
+        rows = self.network(pictures)
+        return torch.cat([rows[..., :2], rows[..., 2:4].clamp(max=_MAX_LOG_SIZE), rows[..., 4:].sigmoid()], dim=2)
+
+
+class SimccNetwork(nn.Module):
+    """Top-down keypoints by coordinate classification (SimCC, Li et al. 2022), with a visibility per point.
+
+    Args:
+        schema: keypoint schema, K points.
+        size: input width and height; each a multiple of 16.
+        widths: channels at strides 2, 4, 8 and 16.
+    """
+
+    def __init__(self, schema: str, size: tuple[int, int], *, widths: Sequence[int] = (16, 32, 56, 88)) -> None:
+        super().__init__()
+        points = keypoint_schema(schema).point_count
+        cells = (size[0] // 8) * (size[1] // 8)
+        self.trunk = Trunk(widths, (0, 1, 2, 2))
+        self.pyramid = Pyramid(widths[2:], widths[2])
+        self.points = nn.Conv2d(widths[2], points, 1)
+        self.along_x = nn.Linear(cells, 2 * size[0])
+        self.along_y = nn.Linear(cells, 2 * size[1])
+        self.seen_locally = nn.Linear(cells, 1)
+        self.seen_globally = nn.Linear(widths[3], points)
+
+    def forward(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """(N, 3, H, W) normalised RGB to logits (N, K, 2 W), (N, K, 2 H) and visibility logits (N, K)."""
+        features = self.trunk(crops)
+        maps = self.points(self.pyramid(features)[0]).flatten(2)
+        seen = self.seen_locally(maps).squeeze(2) + self.seen_globally(features[-1].mean((2, 3)))
+        return self.along_x(maps), self.along_y(maps), seen
+
+
+class SimccGraph(nn.Module):
+    """``SimccNetwork`` as the ``simcc`` contract wants it: both maxima are the probability that the point is seen."""
+
+    def __init__(self, network: SimccNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """``simcc_x`` (N, K, 2 W) and ``simcc_y`` (N, K, 2 H), each at most the visibility, which its maximum is."""
+        along_x, along_y, seen = self.network(crops)
+        visible = seen.sigmoid().unsqueeze(2)
+        return visible * _peak_one(along_x), visible * _peak_one(along_y)
+
+
+def _peak_one(logits: torch.Tensor) -> torch.Tensor:
+    return (logits - logits.amax(dim=2, keepdim=True)).exp()
+
+
+class FieldNetwork(nn.Module):
+    """Composite intensity and association fields at stride 8 for one or more schemas (Kreiss et al. 2019)."""
+
+    def __init__(
+        self, schemas: Sequence[str], *, widths: Sequence[int] = (16, 24, 40, 72, 112), width: int = 64
+    ) -> None:
+        super().__init__()
+        self.tables = [keypoint_schema(name) for name in schemas]
+        self.trunk = Trunk(widths, (0, 0, 1, 1, 2))
+        self.pyramid = Pyramid(widths[2:], width)
+        self.context = ResidualUnit(width)
+        self.cif = nn.ModuleList(nn.Conv2d(width, 4 * table.point_count, 1) for table in self.tables)
+        self.caf = nn.ModuleList(nn.Conv2d(width, 7 * len(table.edges), 1) for table in self.tables)
+        for head, channels in [(head, 4) for head in self.cif] + [(head, 7) for head in self.caf]:
+            nn.init.constant_(head.bias[::channels], -4.6)  # type: ignore[index]
+
+    def forward(self, pictures: torch.Tensor) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Per schema, from (N, 3, H, W) normalised RGB:
+
+        cif (N, K, 4, h, w): confidence logit, x and y offset in cells, log scale;
+        caf (N, E, 7, h, w): confidence logit, both ends' x and y offsets in cells, both log scales.
+        """
+        x = self.context(self.pyramid(self.trunk(pictures))[0])
+        return [
+            (cif(x).unflatten(1, (table.point_count, 4)), caf(x).unflatten(1, (len(table.edges), 7)))
+            for cif, caf, table in zip(self.cif, self.caf, self.tables, strict=True)
+        ]
+
+
+class FieldGraph(nn.Module):
+    """``FieldNetwork`` as the ``cifcaf`` contract wants it, for a fixed field size."""
+
+    offsets: torch.Tensor
+
+    def __init__(self, network: FieldNetwork, *, columns: int, rows: int) -> None:
+        super().__init__()
+        self.network = network
+        y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+        self.register_buffer("offsets", torch.stack([x, y]).float()[None, None])
+
+    def forward(self, pictures: torch.Tensor) -> list[torch.Tensor]:
+        """``cif`` (N, K, 5, h, w) and ``caf`` (N, E, 8, h, w), one pair after the other; units are cells."""
+        outputs = []
+        for cif, caf in self.network(pictures):
+            confidence = cif[:, :, :1].sigmoid()
+            scale = cif[:, :, 3:].clamp(max=_MAX_LOG_SIZE).exp()
+            outputs.append(torch.cat([confidence * 0, confidence, cif[:, :, 1:3] + self.offsets, scale], dim=2))
+            confidence = caf[:, :, :1].sigmoid()
+            ends = [caf[:, :, 1:3] + self.offsets, caf[:, :, 3:5] + self.offsets]
+            scale = caf[:, :, 5:].clamp(max=_MAX_LOG_SIZE).exp()
+            outputs.append(torch.cat([confidence * 0, confidence, *ends, scale], dim=2))
+        return outputs

@@ -1,0 +1,163 @@
+"""Accuracy of the shipped street models on held-out streets, measured through the code that labels real videos.
+
+Judged are objects at least 32 px high of which at least 30 % is visible; others may be found or not. A point of an
+object that was missed counts as wrong.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from labeling.detection import Detections, Detector
+from labeling.fields import FieldModel
+from labeling.keypoints import KeypointHead
+from training.street_pool import ObjectTruth
+
+JUDGED_HEIGHT_PX = 32.0
+JUDGED_SHARE = 0.3
+PCK_SHARE = 0.1
+_MATCH_IOU = 0.5
+_EXCUSED_SHARE = 0.5
+_LANE_MATCH_PX = 20.0
+HIDDEN_SCORE = 0.3
+SURE_SCORE = 0.9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreetModels:
+    """The extractors to judge; any may be absent."""
+
+    detector: Detector | None = None
+    heads: dict[str, KeypointHead] = field(default_factory=dict)
+    """By category."""
+    fields: FieldModel | None = None
+
+
+@dataclass(slots=True)
+class Tally:
+    """Sums over frames; ``figures`` gives the shares."""
+
+    hits: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, name: str, values: Iterable[float] | np.ndarray) -> None:
+        """Append single outcomes (0 or 1, or pixels) to the figure called ``name``."""
+        self.hits.setdefault(name, []).extend(float(value) for value in values)
+
+    def figures(self) -> dict[str, float]:
+        """The mean of every figure, rounded to 4 digits, by name."""
+        return {name: round(float(np.mean(values)), 4) for name, values in sorted(self.hits.items()) if values}
+
+
+def is_judged(truth: ObjectTruth) -> bool:
+    """High and visible enough to be asked for."""
+    return bool(truth.box_xyxy[3] - truth.box_xyxy[1] >= JUDGED_HEIGHT_PX and truth.visible_share >= JUDGED_SHARE)
+
+
+def judge_frame(models: StreetModels, rgb: np.ndarray, truths: tuple[ObjectTruth, ...], tally: Tally) -> None:
+    """Add one frame's outcomes to ``tally``."""
+    if models.detector is not None:
+        found = models.detector.detect([rgb])[0]
+        exact = True
+        for category in ("car", "person"):
+            mine = tuple(truth for truth in truths if truth.category == category)
+            seen = found.select(found.categories == category)
+            partner, phantoms = match_boxes(seen, mine)
+            wanted = [index for index, truth in enumerate(mine) if is_judged(truth)]
+            tally.add(f"{category}_recall", [partner[index] >= 0 for index in wanted])
+            tally.add(f"{category}_phantoms_per_frame", [phantoms])
+            exact &= phantoms == 0 and all(partner[index] >= 0 for index in wanted)
+            if category in models.heads:
+                _judge_points(models.heads[category], rgb, seen, [mine[i] for i in wanted], partner[wanted], tally)
+        tally.add("count_exact", [exact])
+    if models.fields is not None:
+        lanes = tuple(truth for truth in truths if truth.category == "lane")
+        found_lanes = [item.points for item in models.fields.estimate([rgb])[0] if item.category == "lane"]
+        _judge_lanes(found_lanes, lanes, tally)
+
+
+def match_boxes(found: Detections, truths: tuple[ObjectTruth, ...]) -> tuple[np.ndarray, int]:
+    """Greedy one-to-one matches, best detection first.
+
+    Returns:
+        (n,) the detection of each truth or -1, and the number of detections that match nothing and do not lie on an
+        object that is not judged.
+    """
+    partner = np.full(len(truths), -1)
+    phantoms = 0
+    boxes = np.array([truth.box_xyxy for truth in truths]).reshape(-1, 4)
+    for index, box in enumerate(found.boxes_xyxy):
+        overlap, inside = _overlaps(box, boxes)
+        overlap[partner >= 0] = 0
+        best = int(overlap.argmax()) if len(overlap) else -1
+        if best >= 0 and overlap[best] >= _MATCH_IOU:
+            partner[best] = index
+        else:
+            excused = [
+                not is_judged(truth) and share > _EXCUSED_SHARE for truth, share in zip(truths, inside, strict=True)
+            ]
+            phantoms += not any(excused)
+    return partner, phantoms
+
+
+def _overlaps(box: np.ndarray, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    sides = np.minimum(boxes[:, 2:], box[2:]) - np.maximum(boxes[:, :2], box[:2])
+    shared = np.prod(np.maximum(sides, 0), axis=1)
+    area, areas = np.prod(box[2:] - box[:2]), np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
+    return shared / np.maximum(area + areas - shared, 1e-6), shared / max(float(area), 1e-6)
+
+
+def _judge_points(
+    head: KeypointHead,
+    rgb: np.ndarray,
+    seen: Detections,
+    truths: list[ObjectTruth],
+    partner: np.ndarray,
+    tally: Tally,
+) -> None:
+    if not truths:
+        return
+    category = truths[0].category
+    points = head.estimate([rgb], [seen.boxes_xyxy])[0]
+    for truth, match in zip(truths, partner, strict=True):
+        if match < 0:
+            tally.add(f"{category}_pck10", np.zeros(int(truth.visible.sum())))
+            continue
+        mine = points[match]
+        diagonal = float(np.hypot(*(truth.box_xyxy[2:] - truth.box_xyxy[:2])))
+        right = np.hypot(*(mine[:, :2] - truth.points_xy).T) <= PCK_SHARE * diagonal
+        tally.add(f"{category}_pck10", right[truth.visible])
+        tally.add(f"{category}_shown", mine[truth.visible, 2] >= HIDDEN_SCORE)
+        tally.add(f"{category}_hidden_below_0.3", mine[~truth.visible, 2] < HIDDEN_SCORE)
+        tally.add(f"{category}_right_above_0.9", right[mine[:, 2] >= SURE_SCORE])
+
+
+def _judge_lanes(found: list[np.ndarray], truths: tuple[ObjectTruth, ...], tally: Tally) -> None:
+    wanted = [truth for truth in truths if is_judged(truth)]
+    curves = [truth.points_xy for truth in truths]
+    free, errors = set(range(len(curves))), []
+    phantoms = 0
+    for points in found:
+        shown = points[points[:, 2] > 0, :2]
+        gaps = {index: float(np.mean(distance_to_curve(shown, curves[index]))) for index in free}
+        best = min(gaps, key=lambda index: gaps[index], default=-1)
+        if best < 0 or gaps[best] > _LANE_MATCH_PX:
+            phantoms += 1
+            continue
+        free.remove(best)
+        errors.append(gaps[best])
+        tally.add("lane_points_shown", [min(1.0, len(shown) / max(1, int(truths[best].visible.sum())))])
+    missed = [truth for index, truth in enumerate(truths) if index in free and is_judged(truth)]
+    tally.add("lane_error_px", errors)
+    tally.add("lane_recall", [1.0] * (len(wanted) - len(missed)) + [0.0] * len(missed))
+    tally.add("lane_phantoms_per_frame", [phantoms])
+    tally.add("lane_count_exact", [not missed and not phantoms])
+
+
+def distance_to_curve(points_xy: np.ndarray, curve_xy: np.ndarray) -> np.ndarray:
+    """(n,) distance of each point from a polyline (m, 2), pixels."""
+    start, step = curve_xy[:-1], np.diff(curve_xy, axis=0)
+    lengths = np.maximum((step**2).sum(axis=1), 1e-9)
+    along = ((points_xy[:, None] - start) * step).sum(axis=2) / lengths
+    nearest = start + np.clip(along, 0, 1)[..., None] * step
+    return np.hypot(*np.moveaxis(points_xy[:, None] - nearest, 2, 0)).min(axis=1)
