@@ -1,0 +1,91 @@
+"""Synthetic clips with the interface of ``dataset.loader.Sample``, and a tiny cached job, for the training tests."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from labeling.labels import Keypoints
+from training.config import TrainConfig, load_config
+
+FRAMES, WIDTH, HEIGHT = 9, 96, 64
+PICTURE = {"control_width": WIDTH, "control_height": HEIGHT, "rgb_width": WIDTH, "rgb_height": HEIGHT}
+
+
+@dataclass
+class FakeSample:
+    """One clip: a person who walks across a gradient that scrolls."""
+
+    key: str
+    frames_count: int = FRAMES
+    meta: dict[str, Any] = field(default_factory=lambda: {"width": WIDTH, "height": HEIGHT})
+    empty: bool = False
+    """Without any label."""
+
+    @property
+    def seed(self) -> int:
+        return sum(self.key.encode())
+
+    @property
+    def caption(self) -> str:
+        return f"A road, take {self.seed % 3}."
+
+    @property
+    def cam_to_world(self) -> np.ndarray:
+        poses = np.tile(np.eye(4), (self.frames_count, 1, 1))
+        poses[:, 2, 3] = 0.3 * np.arange(self.frames_count)
+        return poses
+
+    def keypoints(self) -> list[Keypoints]:
+        if self.empty:
+            return []
+        return [walker(frame, x=10 + self.seed % 40 + 2 * frame) for frame in range(self.frames_count)]
+
+    def frames(self, suffix: str) -> np.ndarray:
+        rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
+        video = [
+            np.stack([(columns * 2 + 5 * t + self.seed) % 256, (rows * 3) % 256, (rows + columns + t) % 256], axis=-1)
+            for t in range(self.frames_count)
+        ]
+        return np.stack(video).astype(np.uint8)
+
+
+def walker(frame: int, *, x: float, track_id: int = 1) -> Keypoints:
+    """A person of 17 joints, 12 by 34 pixels, in the lower left."""
+    points = np.zeros((17, 3), np.float32)
+    points[:, 0] = x + 6 * np.cos(np.arange(17))
+    points[:, 1] = 20 + 2 * np.arange(17)
+    points[:, 2] = 1
+    box = np.array([x - 6, 20, x + 6, 54], np.float32)
+    return Keypoints(
+        frame=frame, track_id=track_id, category="person", schema="coco17", score=1.0, box_xyxy=box, points=points,
+        point_source=np.ones(17, np.int8),
+    )  # fmt: skip
+
+
+def fake_datasets(train: int = 4, val: int = 2) -> dict[str, list[FakeSample]]:
+    """Clips by split."""
+    return {
+        "train": [FakeSample(key=f"street_{48 * index}") for index in range(train)],
+        "val": [FakeSample(key=f"other_{48 * index}") for index in range(val)],
+    }
+
+
+def cached_job(folder: Path, **settings: Any) -> Path:
+    """A job folder with the tiny latents of the fake clips."""
+    from training.latents import cache_latents
+
+    cache_latents(folder, backbone_name="tiny", picture=PICTURE, datasets=fake_datasets(), **settings)
+    return folder
+
+
+def tiny_config(stage: Any, **overrides: Any) -> TrainConfig:
+    """The tiny recipe at the fake clips' size, without trackers."""
+    tree: dict[str, Any] = {
+        "backbone": {"picture": PICTURE}, "trackers": [], "validation": {"loss_every_steps": 0},
+        "optimiser": {"steps": 4, "global_batch": 2, "micro_batch": 2},
+    }  # fmt: skip
+    for key, value in overrides.items():
+        tree[key] = {**tree.get(key, {}), **value} if isinstance(value, dict) else value
+    return load_config("tiny", stage=stage, overrides=tree)

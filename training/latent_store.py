@@ -1,0 +1,193 @@
+"""A folder of cached latents and how it is read: one safetensors file per clip, text embeddings once per caption.
+
+latents/<backbone>/cache.json             fingerprint, its parts, sizes
+                   clips-<i>of<n>.jsonl   one line per finished clip, appended by part i
+                   clips/<video>/<key>.safetensors   rgb image skeleton ego objects_<v> <control>, mask_<control>
+                   text/<xx>/<sha256 of the caption>.safetensors
+"""
+
+import functools
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+
+from labeling.errors import DataError
+from training.backbone import TextEmbedding
+from training.stages import OBJECTS
+
+MANIFEST = "cache.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClipRecord:
+    """One finished clip."""
+
+    key: str
+    split: str
+    caption: str
+    file: str
+    """Relative to the store's folder."""
+    size: int
+    """Bytes."""
+    source: str
+    """sha256 over what the clip was made from."""
+    object_variants: int = 1
+
+    def line(self) -> str:
+        """As one line of JSON."""
+        return json.dumps(asdict(self), sort_keys=True) + "\n"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CacheManifest:
+    """What a cache was made with."""
+
+    parts: dict[str, str]
+    """sha256 or value by part: vae, text, picture, style, code."""
+    frames: int
+    """Video frames per clip, after ``frame_step``."""
+    fps: float
+    backbone: dict[str, Any]
+    """Its configuration."""
+
+    @property
+    def fingerprint(self) -> str:
+        """sha256 over the parts."""
+        return hashlib.sha256(json.dumps(self.parts, sort_keys=True).encode()).hexdigest()
+
+    def to_json(self) -> str:
+        """The file's text."""
+        return json.dumps({"fingerprint": self.fingerprint, **asdict(self)}, sort_keys=True, indent=1) + "\n"
+
+
+def read_manifest(folder: Path) -> CacheManifest | None:
+    """The manifest of a store, or None where there is none.
+
+    Raises:
+        DataError: a file that is no manifest.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        return None
+    try:
+        tree = json.loads(path.read_text(encoding="utf-8"))
+        return CacheManifest(**{name: tree[name] for name in ("parts", "frames", "fps", "backbone")})
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is no manifest of latents ({error}); remove {folder} and cache again") from error
+
+
+def check_fresh(folder: Path, held: CacheManifest, parts: Mapping[str, str]) -> None:
+    """Refuse latents that were made with something else; only the parts given are compared.
+
+    Raises:
+        DataError: parts differ; both fingerprints and the parts are named.
+    """
+    changed = sorted(name for name, value in parts.items() if held.parts.get(name) != value)
+    if changed:
+        now = CacheManifest(parts={**held.parts, **parts}, frames=held.frames, fps=held.fps, backbone=held.backbone)
+        raise DataError(
+            f"latents in {folder} are stale: they have fingerprint {held.fingerprint[:16]}, this run needs "
+            f"{now.fingerprint[:16]} (changed: {', '.join(changed)}); cache again with `animatic cache --refresh`, or "
+            "go back to the settings they were made with"
+        )
+
+
+class LatentStore:
+    """Cached latents of a job.
+
+    Raises:
+        DataError: nothing cached there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder)
+        manifest = read_manifest(self.folder)
+        if manifest is None:
+            raise DataError(f"{self.folder} holds no latents; make them with `animatic cache JOB --backbone NAME`")
+        self.manifest = manifest
+        self._records = {record.key: record for record in read_records(self.folder)}
+
+    @property
+    def fps(self) -> float:
+        """Frame rate of the cached videos."""
+        return self.manifest.fps
+
+    def keys(self, split: str) -> list[str]:
+        """Keys of a split, sorted."""
+        return sorted(key for key, record in self._records.items() if record.split == split)
+
+    def record(self, key: str) -> ClipRecord:
+        """The clip's record.
+
+        Raises:
+            DataError: the clip is not cached.
+        """
+        if key not in self._records:
+            raise DataError(f"no latents of clip {key} in {self.folder}; run `animatic cache` again, it goes on")
+        return self._records[key]
+
+    def read(self, key: str, names: Iterable[str], *, object_variant: int = 0) -> dict[str, torch.Tensor]:
+        """Latents (C, F, H, W) by name, in the type they are stored in; ``objects`` is the variant asked for.
+
+        Raises:
+            DataError: the clip is not cached, its file is damaged, or a name was not cached.
+        """
+        path = self.folder / self.record(key).file
+        stored = {name: f"{OBJECTS}_{object_variant}" if name == OBJECTS else name for name in names}
+        try:
+            with safe_open(path, framework="pt") as file:
+                known = set(file.keys())
+                absent = [name for name in stored.values() if name not in known]
+                if absent:
+                    raise DataError(
+                        f"{path} holds {', '.join(sorted(known))}, but not {', '.join(absent)}; cache again with "
+                        f"controls={absent}"
+                    )
+                return {name: file.get_tensor(inside) for name, inside in stored.items()}
+        except (OSError, SafetensorError) as error:
+            raise DataError(f"{path} cannot be read ({error}); remove it and run `animatic cache` again") from error
+
+    def mask(self, key: str, control: str) -> torch.Tensor:
+        """(F, H, W) bool: lit latent cells of a control video."""
+        return self.read(key, [f"mask_{control}"])[f"mask_{control}"].bool()
+
+    def text(self, caption: str) -> TextEmbedding:
+        """The embedding of a caption that was cached; the empty one always is.
+
+        Raises:
+            DataError: it was not.
+        """
+        return _read_text(self.folder, caption)
+
+
+@functools.lru_cache(maxsize=256)
+def _read_text(folder: Path, caption: str) -> TextEmbedding:
+    path = text_path(folder, caption)
+    try:
+        with safe_open(path, framework="pt") as file:
+            return TextEmbedding(tokens_LD=file.get_tensor("tokens").float())
+    except (OSError, SafetensorError) as error:
+        raise DataError(f"no embedding of caption {caption!r} in {folder} ({error}); cache again") from error
+
+
+def text_path(folder: Path, caption: str) -> Path:
+    """Where a caption's embedding lies."""
+    name = hashlib.sha256(caption.encode()).hexdigest()
+    return folder / "text" / name[:2] / f"{name}.safetensors"
+
+
+def read_records(folder: Path) -> Sequence[ClipRecord]:
+    """The records of all parts; a later line replaces an earlier one, a torn last line is ignored."""
+    latest: dict[str, ClipRecord] = {}
+    for path in sorted(folder.glob("clips-*.jsonl")):
+        *whole, _torn = path.read_text(encoding="utf-8").split("\n")
+        for line in whole:
+            record = ClipRecord(**json.loads(line))
+            latest[record.key] = record
+    return [latest[key] for key in sorted(latest)]

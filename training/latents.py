@@ -1,0 +1,322 @@
+"""Making latents: each clip's videos through the VAE, each caption through the text encoder, once.
+
+Skeletons are rasterised afresh from keypoints and object and ego videos from tracks and trajectories, since a decoded
+4:2:0 video has lost their colours; only RGB (and controls that have no labels) are decoded. The mask for targeted noise
+comes from the same keypoints. A clip is done when its line is in the part's log; a killed job goes on from there.
+"""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import save
+
+from dataset.receipts import digest, hashed_share, storage_errors, sync_folder
+from labeling.errors import ConfigError, DataError
+from labeling.skeleton_video import DEFAULT_STYLE
+from training.backbone import Backbone, load_backbone
+from training.clip_views import ClipSample, ClipViews, frame_indices
+from training.config import BackboneConfig, PictureConfig, backbone_config
+from training.latent_store import (
+    MANIFEST,
+    CacheManifest,
+    ClipRecord,
+    LatentStore,
+    check_fresh,
+    read_manifest,
+    read_records,
+    text_path,
+)
+from training.stages import EGO, IMAGE, OBJECTS, RGB
+
+CODE_VERSION = 1
+"""Raised whenever the same clip would give other latents."""
+
+Progress = Callable[[int, int], None]
+"""Called with clips done and clips in all."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CacheSummary:
+    """What a caching run did."""
+
+    folder: Path
+    made: int
+    """Clips encoded now."""
+    kept: int
+    """Clips that were there already."""
+    captions: int
+    """Distinct captions of this part."""
+    fingerprint: str
+    bytes: int
+    """Of all clips of this part."""
+
+
+def cache_latents(
+    job_dir: Path | str,
+    *,
+    backbone_name: str,
+    part: tuple[int, int] = (0, 1),
+    progress: Progress | None = None,
+    controls: Sequence[str] = (),
+    object_variants: int = 1,
+    picture: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+    refresh: bool = False,
+    out: Path | None = None,
+    backbone: Backbone | None = None,
+    datasets: Mapping[str, Any] | None = None,
+) -> CacheSummary:
+    """Cache the latents of a job's clips under ``latents/<backbone>``.
+
+    Args:
+        job_dir: the job, or a folder of shards.
+        backbone_name: a preset of ``training.config.BACKBONES``, or a YAML file.
+        part: (i, n): only clips whose key falls to part i of n.
+        progress: called after every clip.
+        controls: names of further control videos in the shards (``segmentation``, ``hdmap``).
+        object_variants: object videos per clip.
+        picture: replaces fields of the backbone's ``picture``.
+        device: where the networks run.
+        refresh: throw away what was made with other settings.
+        out: another folder than ``latents/<backbone>`` in the job.
+        backbone: already loaded.
+        datasets: by split; read from the job's shards if not given.
+
+    Raises:
+        ConfigError: frame counts or sizes that the backbone does not take.
+        DataError: a stale cache (both fingerprints are named), no clips.
+        StorageError: no space left.
+    """
+    config = (
+        backbone.config if backbone else backbone_config(backbone_name, **({"picture": picture} if picture else {}))
+    )
+    datasets = datasets or _shard_datasets(Path(job_dir))
+    folder = out or Path(job_dir) / "latents" / config.name
+    samples = [(split, sample) for split, dataset in datasets.items() for sample in dataset]
+    if not samples:
+        raise DataError(f"{job_dir} has no clips to cache; `animatic status` says what was dropped and why")
+    backbone = backbone or load_backbone(config, device=device)
+    clip_frames = len(samples[0][1].cam_to_world)
+    manifest = plan_manifest(backbone, clip_frames=clip_frames, controls=controls, object_variants=object_variants)
+    with storage_errors(folder):
+        _open_store(folder, manifest, refresh=refresh)
+        mine = [(split, one) for split, one in samples if int(hashed_share("part", one.key) * part[1]) == part[0]]
+        return _cache_part(
+            folder, mine, backbone, manifest, part=part, controls=controls, object_variants=object_variants,
+            progress=progress,
+        )  # fmt: skip
+
+
+def _shard_datasets(job: Path) -> dict[str, Any]:
+    from dataset.loader import ShardDataset
+
+    return {split: ShardDataset(job, split) for split in ("train", "val")}
+
+
+def plan_manifest(
+    backbone: Backbone, *, clip_frames: int, controls: Sequence[str] = (), object_variants: int = 1
+) -> CacheManifest:
+    """What a cache of this backbone depends on; checks sizes before anything is spent.
+
+    Raises:
+        ConfigError: frame counts or sizes that the backbone does not take.
+    """
+    config, picture = backbone.config, backbone.config.picture
+    frames = len(frame_indices(clip_frames, picture))
+    for width, height in ((picture.control_width, picture.control_height), (picture.rgb_width, picture.rgb_height)):
+        backbone.geometry.latent_shape(frames=frames, height=height, width=width)
+    parts = backbone.fingerprint() | {
+        "picture": digest(picture.model_dump() | {"frames": frames}),
+        "style": digest(asdict(DEFAULT_STYLE)),
+        "code": str(CODE_VERSION),
+        "storage": f"{config.latent_dtype}, {config.text_tokens} text tokens, {object_variants} object variants",
+        "controls": ",".join(sorted(controls)),
+    }
+    return CacheManifest(parts=parts, frames=frames, fps=picture.fps, backbone=config.model_dump(mode="json"))
+
+
+def _open_store(folder: Path, manifest: CacheManifest, *, refresh: bool) -> None:
+    held = read_manifest(folder)
+    if held is not None and held.parts != manifest.parts:
+        if not refresh:
+            check_fresh(folder, held, manifest.parts)
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    if held is None or held.parts != manifest.parts:
+        write_whole(folder / MANIFEST, manifest.to_json().encode())
+
+
+def _cache_part(
+    folder: Path, samples: Sequence[tuple[str, Any]], backbone: Backbone, manifest: CacheManifest, *,
+    part: tuple[int, int], controls: Sequence[str], object_variants: int, progress: Progress | None,
+) -> CacheSummary:  # fmt: skip
+    held = {record.key: record for record in read_records(folder)}
+    log = folder / f"clips-{part[0]}of{part[1]}.jsonl"
+    _cut_torn_line(log)
+    made, total_bytes, captions = 0, 0, {""}
+    _cache_texts(folder, [""], backbone)
+    for done, (split, sample) in enumerate(samples, start=1):
+        source = _source_digest(sample)
+        record = held.get(sample.key)
+        if not (record and _is_whole(folder, record, source=source, split=split)):
+            tensors = encode_clip(sample, backbone, manifest, controls=controls, object_variants=object_variants)
+            record = _write_clip(folder, tensors, sample, split=split, source=source, object_variants=object_variants)
+            made += 1
+            _cache_texts(folder, [record.caption], backbone)
+            _append_line(log, record.line())
+        captions.add(record.caption)
+        total_bytes += record.size
+        if progress:
+            progress(done, len(samples))
+    return CacheSummary(
+        folder=folder, made=made, kept=len(samples) - made, captions=len(captions) - 1, bytes=total_bytes,
+        fingerprint=manifest.fingerprint,
+    )  # fmt: skip
+
+
+def encode_clip(
+    sample: ClipSample, backbone: Backbone, manifest: CacheManifest, *, controls: Sequence[str] = (),
+    object_variants: int = 1,
+) -> dict[str, torch.Tensor]:  # fmt: skip
+    """All latents of one clip by name, in the storage type, and the skeleton's mask as uint8."""
+    picture = backbone.config.picture.model_copy(update={"frames": manifest.frames})
+    meta = sample.meta
+    views = ClipViews(
+        sample=sample, picture=picture, indices=frame_indices(len(sample.cam_to_world), picture),
+        label_width=int(meta.get("width", 1056)), label_height=int(meta.get("height", 704)),
+    )  # fmt: skip
+    dtype = getattr(torch, backbone.config.latent_dtype)
+    tensors = {
+        name: backbone.encode_video(frames).to(dtype) for name, frames in _videos(views, controls, object_variants)
+    }
+    tensors["mask_skeleton"] = torch.from_numpy(views.skeleton_cells(backbone.geometry).astype(np.uint8))
+    for name in controls:
+        # Every cell counts where there are no labels to say which are lit.
+        tensors[f"mask_{name}"] = torch.ones(tensors[name].shape[1:], dtype=torch.uint8)
+    return {name: tensor.contiguous() for name, tensor in tensors.items()}
+
+
+def _videos(views: ClipViews, controls: Sequence[str], object_variants: int) -> Iterator[tuple[str, np.ndarray]]:
+    rgb = views.rgb()
+    yield RGB, rgb
+    yield IMAGE, views.image(rgb)
+    yield "skeleton", views.skeleton()
+    yield EGO, views.ego()
+    for variant in range(object_variants):
+        yield f"{OBJECTS}_{variant}", views.objects(variant)
+    for name in controls:
+        yield name, views.control(name)
+
+
+def _source_digest(sample: Any) -> str:
+    members = getattr(sample, "members", None)
+    return digest({suffix: member.sha256 for suffix, member in members.items()} if members else sample.key)
+
+
+def _is_whole(folder: Path, record: ClipRecord, *, source: str, split: str) -> bool:
+    path = folder / record.file
+    fresh = (record.source, record.split) == (source, split)
+    return (
+        fresh and path.is_file() and path.stat().st_size == record.size and text_path(folder, record.caption).is_file()
+    )
+
+
+def _write_clip(
+    folder: Path, tensors: Mapping[str, torch.Tensor], sample: ClipSample, *, split: str, source: str,
+    object_variants: int,
+) -> ClipRecord:  # fmt: skip
+    path = folder / "clips" / sample.key.rpartition("_")[0] / f"{sample.key}.safetensors"
+    data = save(dict(tensors), metadata={"key": sample.key})
+    write_whole(path, data)
+    return ClipRecord(
+        key=sample.key, split=split, caption=sample.caption, file=str(path.relative_to(folder)), size=len(data),
+        source=source, object_variants=object_variants,
+    )  # fmt: skip
+
+
+def _cache_texts(folder: Path, captions: Sequence[str], backbone: Backbone) -> None:
+    for caption in captions:
+        path = text_path(folder, caption)
+        if not path.is_file():
+            tokens = backbone.encode_text([caption])[0].tokens_LD.to(getattr(torch, backbone.config.latent_dtype))
+            write_whole(path, save({"tokens": tokens.contiguous()}, metadata={"caption": caption}))
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file under a temporary name, sync it, rename it: it is there whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def _append_line(log: Path, line: str) -> None:
+    with log.open("a", encoding="utf-8") as file:
+        file.write(line)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _cut_torn_line(log: Path) -> None:
+    if log.is_file():
+        data = log.read_bytes()
+        if data and not data.endswith(b"\n"):
+            write_whole(log, data[: data.rfind(b"\n") + 1])
+
+
+def open_store(job_dir: Path, config: BackboneConfig) -> LatentStore:
+    """The store of a backbone in a job (or the store's own folder).
+
+    Raises:
+        DataError: nothing was cached.
+    """
+    own = Path(job_dir)
+    return LatentStore(own if (own / MANIFEST).is_file() else own / "latents" / config.name)
+
+
+def check_store(store: LatentStore, config: BackboneConfig, *, vae_fingerprint: str | None = None) -> None:
+    """Refuse latents that do not fit what a run needs.
+
+    Raises:
+        DataError: stale; both fingerprints and what changed are named.
+    """
+    frames = config.picture.frames or store.manifest.frames
+    parts = {"picture": digest(config.picture.model_dump() | {"frames": frames}), "code": str(CODE_VERSION)}
+    parts["style"] = digest(asdict(DEFAULT_STYLE))
+    if vae_fingerprint is not None:
+        parts["vae"] = vae_fingerprint
+    check_fresh(store.folder, store.manifest, parts)
+
+
+def manifest_picture(store: LatentStore) -> PictureConfig:
+    """The sizes that a store was made at, its frame count filled in.
+
+    Raises:
+        ConfigError: a manifest of another version.
+    """
+    try:
+        return PictureConfig.model_validate(store.manifest.backbone["picture"] | {"frames": store.manifest.frames})
+    except (KeyError, ValueError) as error:
+        raise ConfigError(f"{store.folder / MANIFEST} names no picture ({error}); cache again") from error
+
+
+def to_json(summary: CacheSummary) -> str:
+    """The summary as one line of JSON."""
+    return json.dumps({**asdict(summary), "folder": str(summary.folder)}, sort_keys=True)
