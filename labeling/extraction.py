@@ -1,22 +1,56 @@
-"""Frames of a run to tracked keypoints: detection, keypoint heads, fields, tracks."""
+"""Frames of a run to tracked, steady keypoints, looking no more often than the scene needs.
 
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import islice
+The networks are nearly all the cost. With ``exact`` they see every frame; with the other efforts they see some, and between
+these the points of cars and people are carried by optical flow, and lanes, which have no points of their own to follow, by
+straight lines. Looks come closer together when objects grow fast, appear, vanish, or are not where flow said; a network
+that has seen nothing for a second looks twice per second.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from labeling.detection import Detections
+from labeling.carrying import box_diagonal, carry, close_gap, interpolate_gap, small_grey
 from labeling.extractors import Extractors
-from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
-from labeling.schemas import CATEGORIES, Category, keypoint_schema
-from labeling.tracking import assign_tracks
+from labeling.labels import Keypoints
+from labeling.observation import Look, looks_of
+from labeling.smoothing import smooth_tracks
+from labeling.tracking import RunTracker, drop_passing_tracks
 
 Effort = Literal["fast", "balanced", "exact"]
 
-_BATCH_FRAMES = 8
-_BOX_SCHEMA: dict[Category, str] = {"car": "car24", "person": "coco17"}
-"""The schema of an object whose keypoints no network gives: a box with absent points still has a track."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EffortSettings:
+    """How often the networks look. Gaps are in frames of the 24 fps grid; 1 is every frame."""
+
+    max_gap: int
+    """Longest time between two looks: half a second at most, so that nothing is shown that was not seen 0.25 s away."""
+    max_person_gap: int
+    """The same while someone walks: legs swing at about 1 Hz and do not go straight."""
+    max_bend: float = 0.03
+    """Share of its size by which an object's growth may depart from a straight line between two looks."""
+    max_miss: float = 0.03
+    """Share of the box diagonal by which carried points may miss the next look before looks come closer together."""
+    flow: bool = True
+    """Carry points by optical flow; else they go straight from look to look."""
+    quiet_frames: int = 24
+    """A network that has seen nothing for so long looks only every ``quiet_gap`` frames."""
+    quiet_gap: int = 12
+
+
+EFFORTS: dict[Effort, EffortSettings] = {
+    "exact": EffortSettings(max_gap=1, max_person_gap=1, quiet_gap=1),
+    "balanced": EffortSettings(max_gap=6, max_person_gap=4),
+    "fast": EffortSettings(max_gap=12, max_person_gap=6, max_bend=0.05, max_miss=0.05),
+}
+
+_MIN_LOOKS = 2
+_MIN_FRAMES = 6
+"""What lasts less than a quarter of a second, or was seen once, is taken for a mistake."""
 
 
 def label_frames(
@@ -24,7 +58,7 @@ def label_frames(
     *,
     first_frame: int,
     extractors: Extractors,
-    effort: Effort = "balanced",
+    effort: Effort | EffortSettings = "balanced",
     breaks: frozenset[int] = frozenset(),
 ) -> list[Keypoints]:
     """Tracked labels of the consecutive frames of one run.
@@ -37,67 +71,160 @@ def label_frames(
         breaks: grid numbers of frames before which nothing may be carried over (a hard cut, a hole).
 
     Returns:
-        Labels in the order of frames, then of categories and tracks. Objects whose category has no keypoint network
-        have a box, a track and absent points.
+        Labels in the order of frames, then of tracks, whose ids count from 0 as objects appear. Objects whose category
+        has no keypoint network have a box, a track and absent points.
 
     Raises:
         ModelError: a network's output that is not finite.
     """
-    observed: list[list[Keypoints]] = []
-    for batch in _batches(frames, _BATCH_FRAMES):
-        observed += observe(batch, extractors, first_frame=first_frame + len(observed))
-    tracked = assign_tracks(observed, breaks=frozenset(frame - first_frame for frame in breaks))
-    return [label for labels in tracked for label in labels]
+    return label_with(looks_of(extractors), frames, first_frame=first_frame, effort=effort, breaks=breaks)
 
 
-def observe(frames: Sequence[np.ndarray], extractors: Extractors, *, first_frame: int = 0) -> list[list[Keypoints]]:
-    """Untracked labels of each frame, everything looked at."""
-    labels: list[list[Keypoints]] = [[] for _ in frames]
-    if extractors.detector:
-        detections = extractors.detector.detect(frames)
-        for category in CATEGORIES:
-            if category in _BOX_SCHEMA and not _from_fields(category, extractors):
-                _add_top_down(labels, frames, detections, extractors, category=category, first_frame=first_frame)
-    for model in extractors.fields:
-        for found, objects in zip(labels, model.estimate(frames, first_frame=first_frame), strict=True):
-            found += [label for label in objects if label.category not in extractors.heads]
-    return labels
-
-
-def _from_fields(category: Category, extractors: Extractors) -> bool:
-    """Whether a category's objects come from a bottom-up network alone."""
-    schemas = [name for model in extractors.fields for name in model.schema_names]
-    return category not in extractors.heads and any(keypoint_schema(name).category == category for name in schemas)
-
-
-def _add_top_down(
-    labels: list[list[Keypoints]],
-    frames: Sequence[np.ndarray],
-    detections: Sequence[Detections],
-    extractors: Extractors,
+def label_with(
+    looks: Iterable[Look],
+    frames: Iterable[np.ndarray],
     *,
-    category: Category,
     first_frame: int,
-) -> None:
-    chosen = [found.of_category(category) for found in detections]
-    head = extractors.heads.get(category)
-    schema = head.schema_name if head else _BOX_SCHEMA[category]
-    if head:
-        points = head.estimate(frames, [found.boxes_xyxy for found in chosen])
-    else:
-        points = [np.zeros((len(found), keypoint_schema(schema).point_count, 3), np.float32) for found in chosen]
-    for index, (found, bodies) in enumerate(zip(chosen, points, strict=True)):
-        labels[index] += [
-            Keypoints(
-                frame=first_frame + index, category=category, schema=schema, score=float(score),
-                box_xyxy=box.astype(np.float32), points=body.astype(np.float32),
-                point_source=np.where(body[:, 2] > 0, POINT_DETECTED, POINT_ABSENT).astype(np.int8),
-            )
-            for box, score, body in zip(found.boxes_xyxy, found.scores, bodies, strict=True)
-        ]  # fmt: skip
+    effort: Effort | EffortSettings = "balanced",
+    breaks: frozenset[int] = frozenset(),
+) -> list[Keypoints]:
+    """As ``label_frames``, for anything that looks at a frame and tells what it sees."""
+    settings = effort if isinstance(effort, EffortSettings) else EFFORTS[effort]
+    channels = [_Channel(look, settings) for look in looks]
+    for number, frame in enumerate(frames, start=first_frame):
+        grey = _Once(frame)
+        for channel in channels:
+            channel.push(frame, grey, number=number, fresh=number in breaks)
+    for channel in channels:
+        channel.finish()
+    labels = _renumbered([channel.labels for channel in channels])
+    labels = drop_passing_tracks(labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES)
+    return smooth_tracks(labels, breaks=breaks)
 
 
-def _batches(frames: Iterable[np.ndarray], size: int) -> Iterator[list[np.ndarray]]:
-    source = iter(frames)
-    while batch := list(islice(source, size)):
-        yield batch
+class _Once:
+    """The small grey picture of a frame, made when somebody first needs it."""
+
+    def __init__(self, frame: np.ndarray) -> None:
+        self._frame = frame
+        self._grey: np.ndarray | None = None
+
+    def __call__(self) -> np.ndarray:
+        if self._grey is None:
+            self._grey = small_grey(self._frame)
+        return self._grey
+
+
+class _Channel:
+    """One kind of look (objects, or a bottom-up network's) with its own rhythm, tracks and carried points."""
+
+    def __init__(self, look: Look, settings: EffortSettings) -> None:
+        self.look, self.settings = look, settings
+        self.labels: list[Keypoints] = []
+        self.looks = 0
+        self._tracker = RunTracker()
+        self._forget()
+
+    def _forget(self) -> None:
+        self._tracker.restart()
+        self._key: list[Keypoints] = []
+        self._key_frame: int | None = None
+        self._paths: dict[int, list[Keypoints]] = {}
+        self._previous: Callable[[], np.ndarray] | None = None
+        self._gap, self._quiet = 1, 0
+
+    def push(self, frame: np.ndarray, grey: Callable[[], np.ndarray], *, number: int, fresh: bool) -> None:
+        """The next frame of the run; ``fresh`` when nothing of the one before it holds any more."""
+        if fresh:
+            self.finish()
+            self._forget()
+        healthy = self._carry(grey, number)
+        if self._key_frame is None or number - self._key_frame >= self._gap or not healthy:
+            self._look(frame, number)
+        self._previous = grey
+
+    def finish(self) -> None:
+        """The run, or what came before a cut, ends: what was carried so far is all that will be known."""
+        for path in self._paths.values():
+            self.labels += path[1:]
+        self._paths = {}
+
+    def _carry(self, grey: Callable[[], np.ndarray], number: int) -> bool:
+        """Carry the last look's objects into this frame; False when one of them was lost on the way."""
+        if not (self.settings.flow and self.look.carries and self._paths and self._previous):
+            return True
+        if self.settings.max_gap == 1:
+            return True
+        latest = [path[-1] for path in self._paths.values()]
+        carried = carry(self._previous(), grey(), latest, frame=number)
+        for path, moved in zip(self._paths.values(), carried, strict=True):
+            path.append(moved.label)
+        return all(moved.followed for moved in carried)
+
+    def _look(self, frame: np.ndarray, number: int) -> None:
+        seen = self._tracker.update(self.look.see(frame, number), frame=number)
+        self.looks += 1
+        miss = self._close(seen, number)
+        self.labels += seen
+        self._gap = self._next_gap(seen, miss, number)
+        self._quiet = (
+            0 if seen else self._quiet + (number - (self._key_frame if self._key_frame is not None else number))
+        )
+        self._key, self._key_frame = seen, number
+        self._paths = {label.track_id: [label] for label in seen}
+
+    def _close(self, seen: list[Keypoints], number: int) -> float:
+        """Labels between the last look and this one; returns the median miss of carried points, in box diagonals."""
+        now = {label.track_id: label for label in seen}
+        misses = []
+        for label in self._key:
+            path, end = self._paths.get(label.track_id, [label]), now.get(label.track_id)
+            if end is None:
+                # Lost from sight: kept for as long as flow may be believed without a second look.
+                self.labels += [step for step in path[1:] if step.frame < number][: self.settings.max_gap // 2]
+            elif len(path) == number - label.frame + 1 and len(path) > 2:
+                misses.append(_miss(path[-1], end))
+                self.labels += close_gap(path, end)
+            else:
+                self.labels += interpolate_gap(label, end)
+        return float(np.median(misses)) if misses else 0.0
+
+    def _next_gap(self, seen: list[Keypoints], miss: float, number: int) -> int:
+        if not seen:
+            quiet = self._quiet + number - (self._key_frame if self._key_frame is not None else number)
+            return self.settings.quiet_gap if quiet >= self.settings.quiet_frames else min(self.settings.max_gap, 4)
+        before = {label.track_id: label for label in self._key}
+        gap = float(min(self.settings.max_gap, self._gap + 2 if miss <= self.settings.max_miss else self._gap // 2))
+        if set(before) != {label.track_id for label in seen}:
+            gap = min(gap, max(1, self.settings.max_gap // 2))
+        for label in seen:
+            if label.category == "person":
+                gap = min(gap, self.settings.max_person_gap)
+            if label.track_id in before:
+                gap = min(gap, _straight_gap(before[label.track_id], label, max_bend=self.settings.max_bend))
+        return max(1, int(gap))
+
+
+def _straight_gap(before: Keypoints, after: Keypoints, *, max_bend: float) -> float:
+    """How long an object may be taken to grow evenly: size goes as 1 / distance, whose bend over a gap is (r gap)^2 / 4."""
+    frames = after.frame - before.frame
+    rate = abs(math.log(box_diagonal(after.box_xyxy) / box_diagonal(before.box_xyxy))) / max(1, frames)
+    return math.sqrt(4 * max_bend) / rate if rate > 0 else math.inf
+
+
+def _miss(carried: Keypoints, seen: Keypoints) -> float:
+    both = carried.present & seen.present
+    if not both.any():
+        return 0.0
+    distance = np.linalg.norm(carried.points[both, :2] - seen.points[both, :2], axis=1)
+    return float(np.median(distance)) / box_diagonal(seen.box_xyxy)
+
+
+def _renumbered(channels: list[list[Keypoints]]) -> list[Keypoints]:
+    """All channels' labels by frame, with ids that count from 0 as objects appear."""
+    ordered = sorted(
+        ((label, index) for index, labels in enumerate(channels) for label in labels),
+        key=lambda pair: (pair[0].frame, pair[1], pair[0].track_id),
+    )
+    ids: dict[tuple[int, int], int] = {}
+    return [replace(label, track_id=ids.setdefault((i, label.track_id), len(ids))) for label, i in ordered]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from labeling.labels import UNTRACKED, Keypoints
+from labeling.labels import POINT_DETECTED, UNTRACKED, Keypoints
 
 _FORBIDDEN = 1e6
 
@@ -129,50 +129,84 @@ class BoxTracker:
         return self.next_id - 1
 
 
+class RunTracker:
+    """Ids for all categories of a run: they count from 0 in the order in which objects appear."""
+
+    def __init__(self, settings: TrackerSettings | None = None) -> None:
+        self._settings = settings
+        self._trackers: dict[str, BoxTracker | LaneTracker] = {}
+        self._next_id = 0
+        self._frame: int | None = None
+
+    def restart(self) -> None:
+        """Forget all objects: what comes after a cut or a hole is new. Ids go on counting."""
+        self._trackers, self._frame = {}, None
+
+    def update(
+        self, labels: Sequence[Keypoints], *, frame: int, previous_to_current: np.ndarray | None = None
+    ) -> list[Keypoints]:
+        """One frame's labels with ids; those that belong to no track are left out.
+
+        Args:
+            labels: everything seen in the frame.
+            frame: its grid number, later than the last call's.
+            previous_to_current: as ``BoxTracker.update`` takes it.
+        """
+        step = frame - self._frame if self._frame is not None else 1
+        self._frame = frame
+        out: list[Keypoints] = []
+        for category in sorted({label.category for label in labels} | set(self._trackers)):
+            group = [label for label in labels if label.category == category]
+            tracker = self._trackers.get(category) or (
+                LaneTracker() if category == "lane" else BoxTracker(self._settings)
+            )
+            self._trackers[category] = tracker
+            tracker.next_id = self._next_id
+            ids = _update(tracker, group, step, previous_to_current)
+            self._next_id = tracker.next_id
+            out += [replace(label, track_id=int(i)) for label, i in zip(group, ids, strict=True) if i != UNTRACKED]
+        return out
+
+
 def assign_tracks(
     frames: Sequence[Sequence[Keypoints]],
     *,
     settings: TrackerSettings | None = None,
     breaks: frozenset[int] = frozenset(),
-    homographies: Sequence[np.ndarray | None] | None = None,
 ) -> list[list[Keypoints]]:
-    """Labels with track ids, those that belong to no track left out.
-
-    Ids count from 0 over all categories of a run, in the order in which objects appear, and start afresh at each break.
+    """Labels of consecutive frames with track ids, those that belong to no track left out.
 
     Args:
         frames: the labels of consecutive frames.
         settings: thresholds.
         breaks: positions in ``frames`` before which nothing may be carried over (a hard cut, a hole).
-        homographies: for each frame, how the camera's turn moved far points since the one before; or None.
     """
-    trackers: dict[str, BoxTracker | LaneTracker] = {}
-    next_id = 0
-    tracked: list[list[Keypoints]] = []
+    tracker = RunTracker(settings)
+    tracked = []
     for position, labels in enumerate(frames):
         if position in breaks:
-            trackers = {}
-        turn = homographies[position] if homographies is not None else None
-        out: list[Keypoints] = []
-        for category in sorted({label.category for label in labels} | set(trackers)):
-            group = [label for label in labels if label.category == category]
-            tracker = trackers.get(category) or (LaneTracker() if category == "lane" else BoxTracker(settings))
-            trackers[category] = tracker
-            tracker.next_id = next_id
-            ids = _update(tracker, group, turn)
-            next_id = tracker.next_id
-            out += [replace(label, track_id=int(i)) for label, i in zip(group, ids, strict=True) if i != UNTRACKED]
-        tracked.append(out)
+            tracker.restart()
+        tracked.append(tracker.update(labels, frame=position))
     return tracked
 
 
-def drop_short_tracks(frames: Sequence[Sequence[Keypoints]], *, min_frames: int) -> list[list[Keypoints]]:
-    """Without the tracks that were seen in fewer than ``min_frames`` frames: a network's passing mistakes."""
-    seen: dict[int, int] = {}
-    for labels in frames:
-        for label in labels:
-            seen[label.track_id] = seen.get(label.track_id, 0) + 1
-    return [[label for label in labels if seen[label.track_id] >= min_frames] for labels in frames]
+def drop_passing_tracks(labels: Sequence[Keypoints], *, min_looks: int, min_frames: int) -> list[Keypoints]:
+    """Without tracks that a network saw fewer than ``min_looks`` times, or that last less than ``min_frames``: mistakes.
+
+    What optical flow carried or a neighbour lent does not count as a look; an object without keypoints counts by its box.
+    """
+    looks: dict[int, int] = {}
+    frames: dict[int, list[int]] = {}
+    for label in labels:
+        seen = not label.present.any() or (label.point_source == POINT_DETECTED).any()
+        looks[label.track_id] = looks.get(label.track_id, 0) + bool(seen)
+        frames.setdefault(label.track_id, []).append(label.frame)
+    return [
+        label
+        for label in labels
+        if looks[label.track_id] >= min_looks
+        and max(frames[label.track_id]) - min(frames[label.track_id]) + 1 >= min_frames
+    ]
 
 
 class LaneTracker:
@@ -183,7 +217,7 @@ class LaneTracker:
         self.max_distance_px, self.max_lost_frames = max_distance_px, max_lost_frames
         self._lines: dict[int, tuple[np.ndarray, int]] = {}
 
-    def update(self, lines: Sequence[np.ndarray]) -> np.ndarray:
+    def update(self, lines: Sequence[np.ndarray], *, frame_step: int = 1) -> np.ndarray:
         """Ids for the lines of the next frame, each (K, 3) x, y, score in pixels; absent points have score 0."""
         ids = np.full(len(lines), UNTRACKED)
         known = sorted(self._lines)
@@ -196,7 +230,11 @@ class LaneTracker:
         for column in np.flatnonzero(ids == UNTRACKED):
             ids[column] = self.next_id
             self.next_id += 1
-        self._lines = {i: (line, age + 1) for i, (line, age) in self._lines.items() if age < self.max_lost_frames}
+        self._lines = {
+            i: (line, age + frame_step)
+            for i, (line, age) in self._lines.items()
+            if age + frame_step <= self.max_lost_frames
+        }
         self._lines |= {int(i): (np.asarray(line), 0) for i, line in zip(ids, lines, strict=True)}
         return ids
 
@@ -233,11 +271,14 @@ def iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
     return shared / np.maximum(area_a[:, None] + area_b[None] - shared, 1e-9)
 
 
-def _update(tracker: BoxTracker | LaneTracker, group: list[Keypoints], turn: np.ndarray | None) -> np.ndarray:
+def _update(
+    tracker: BoxTracker | LaneTracker, group: list[Keypoints], step: int, turn: np.ndarray | None
+) -> np.ndarray:
     if isinstance(tracker, LaneTracker):
-        return tracker.update([label.points for label in group])
+        return tracker.update([label.points for label in group], frame_step=step)
     boxes = np.array([label.box_xyxy for label in group], np.float64).reshape(-1, 4)
-    return tracker.update(boxes, np.array([label.score for label in group]), previous_to_current=turn)
+    scores = np.array([label.score for label in group])
+    return tracker.update(boxes, scores, frame_step=step, previous_to_current=turn)
 
 
 def _grown(boxes_xyxy: np.ndarray, buffer: float) -> np.ndarray:

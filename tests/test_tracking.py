@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from labeling.labels import UNTRACKED, Keypoints
-from labeling.tracking import BoxTracker, LaneTracker, assign_tracks, drop_short_tracks, iou, line_distance
+from labeling.tracking import BoxTracker, LaneTracker, assign_tracks, drop_passing_tracks, iou, line_distance
 
 
 def box(x: float, y: float = 300, *, width: float = 40, height: float = 100) -> np.ndarray:
@@ -102,10 +102,12 @@ def test_nothing_is_carried_over_a_break() -> None:
     assert [labels[0].track_id for labels in cut] == [0] * 5 + [1] * 5
 
 
-def test_short_tracks_are_dropped_and_only_they() -> None:
+def test_passing_tracks_are_dropped_and_only_they() -> None:
     frames = [[car(t, 100)] + ([car(t, 800)] if t == 4 else []) for t in range(10)]
-    kept = drop_short_tracks(assign_tracks(frames), min_frames=3)
-    assert [len(labels) for labels in kept] == [1] * 10
+    tracked = [label for labels in assign_tracks(frames) for label in labels]
+    kept = drop_passing_tracks(tracked, min_looks=2, min_frames=6)
+    assert [label.frame for label in kept] == list(range(10))
+    assert drop_passing_tracks(tracked, min_looks=1, min_frames=1) == tracked
 
 
 def lane(offset: float) -> np.ndarray:

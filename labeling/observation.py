@@ -1,0 +1,90 @@
+"""What the networks see in one frame: detection with keypoint heads, and bottom-up fields."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from labeling.detection import Detections
+from labeling.extractors import Extractors
+from labeling.fields import FieldModel
+from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
+from labeling.schemas import Category, keypoint_schema
+
+_BOX_SCHEMA: dict[Category, str] = {"car": "car24", "person": "coco17"}
+"""The schema of an object whose keypoints no network gives: a box with absent points still has a track."""
+
+
+class Look(Protocol):
+    """Something that tells what is in a frame."""
+
+    carries: bool
+    """Whether the points it gives lie on things that optical flow can follow."""
+
+    def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
+        """Untracked labels of an (H, W, 3) uint8 RGB frame, numbered ``number``."""
+        ...
+
+
+def looks_of(extractors: Extractors) -> list[Look]:
+    """The looks that the opened networks allow, each independent of the others."""
+    looks: list[Look] = []
+    bottom_up = {keypoint_schema(name).category for model in extractors.fields for name in model.schema_names}
+    if extractors.detector:
+        categories = tuple(c for c in _BOX_SCHEMA if c in extractors.heads or c not in bottom_up)
+        looks.append(ObjectLook(extractors, categories))
+    taken = set(extractors.heads)
+    for model in extractors.fields:
+        wanted = {keypoint_schema(name).category for name in model.schema_names} - taken
+        looks.append(FieldLook(model, frozenset(wanted)))
+        taken |= wanted
+    return looks
+
+
+class ObjectLook:
+    """Boxes of a detector, with the points of the heads in them."""
+
+    carries = True
+
+    def __init__(self, extractors: Extractors, categories: tuple[Category, ...]) -> None:
+        self.extractors, self.categories = extractors, categories
+
+    def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
+        """As ``Look.see``."""
+        assert self.extractors.detector is not None
+        (detections,) = self.extractors.detector.detect([frame])
+        return [
+            label for category in self.categories for label in self._of_category(frame, detections, category, number)
+        ]
+
+    def _of_category(
+        self, frame: np.ndarray, detections: Detections, category: Category, number: int
+    ) -> Sequence[Keypoints]:
+        found = detections.of_category(category)
+        head = self.extractors.heads.get(category)
+        schema = head.schema_name if head else _BOX_SCHEMA[category]
+        if head:
+            (bodies,) = head.estimate([frame], [found.boxes_xyxy])
+        else:
+            bodies = np.zeros((len(found), keypoint_schema(schema).point_count, 3), np.float32)
+        return [
+            Keypoints(
+                frame=number, category=category, schema=schema, score=float(score),
+                box_xyxy=box.astype(np.float32), points=body.astype(np.float32),
+                point_source=np.where(body[:, 2] > 0, POINT_DETECTED, POINT_ABSENT).astype(np.int8),
+            )
+            for box, score, body in zip(found.boxes_xyxy, found.scores, bodies, strict=True)
+        ]  # fmt: skip
+
+
+class FieldLook:
+    """Objects of a bottom-up network."""
+
+    def __init__(self, model: FieldModel, categories: frozenset[Category]) -> None:
+        self.model, self.categories = model, categories
+        self.carries = categories != {"lane"}
+
+    def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
+        """As ``Look.see``."""
+        (objects,) = self.model.estimate([frame], first_frame=number)
+        return [label for label in objects if label.category in self.categories]
