@@ -17,11 +17,9 @@ from labeling.conversion import FrameConverter, OutputPicture
 from labeling.encoding import EncoderSettings, VideoWriter, copy_packets
 from labeling.errors import ConfigError, VideoError
 from labeling.run_encoder import RunEncoder
-from labeling.video import SAME_TIME_S, probe, source_frames
+from labeling.video import HOLE_S, SAME_TIME_S, probe, source_frames
 
 FPS = 24
-HOLE_S = 0.25
-"""A longer gap between source frames is a hole."""
 
 # Times come from integer ticks of 1e-6 s or more, so a tie is exact but for rounding.
 _TIE_S = 1e-7

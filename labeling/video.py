@@ -41,6 +41,8 @@ __all__ = [
     "source_frames",
 ]
 
+HOLE_S = 0.25
+"""A longer gap between source frames is a hole."""
 _B_FRAME = 3
 _PROBED_FRAMES = 3
 
@@ -303,6 +305,7 @@ def _upright_turn_deg(frame: av.VideoFrame) -> int:
 def _decode(stream: av.VideoStream, packets: Iterable[av.Packet | None]) -> Iterator[SourceFrame]:
     """Frames in the order they are shown. After an error, frames are unclean up to the next keyframe shown after it."""
     broken_at_s = -math.inf
+    last_s = math.inf
     clean = True
     for packet in packets:
         pictures: list[av.VideoFrame] = []
@@ -319,7 +322,8 @@ def _decode(stream: av.VideoStream, packets: Iterable[av.Packet | None]) -> Iter
             if picture.pts is None or picture.time_base is None:
                 continue
             time_s = seconds(picture.pts, picture.time_base)
-            if picture.is_corrupt:
+            # Lost packets need leave no other trace than the time that they should have filled.
+            if picture.is_corrupt or (time_s - last_s > HOLE_S and not picture.key_frame):
                 clean = False
             elif picture.key_frame and time_s > broken_at_s:
                 clean = True
@@ -327,6 +331,7 @@ def _decode(stream: av.VideoStream, packets: Iterable[av.Packet | None]) -> Iter
                 time_s=time_s, picture=picture, is_keyframe=picture.key_frame, is_clean=clean,
                 is_bidirectional=int(picture.pict_type) == _B_FRAME,
             )  # fmt: skip
+            last_s = time_s
 
 
 def _deinterlaced(frames: Iterator[SourceFrame]) -> Iterator[SourceFrame]:
