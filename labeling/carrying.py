@@ -1,7 +1,7 @@
 """Points carried from frame to frame by optical flow, with a check that says when they cannot be.
 
 Sparse Lucas-Kanade on half-size grey pictures, forward and backward (Kalal et al. 2010: what does not come back to
-where it started was not followed). An object is followed as a whole: points that lost their ground move as the others do.
+where it started was not followed). An object is followed as a whole: points that lost their ground move with the rest.
 """
 
 from dataclasses import dataclass, replace

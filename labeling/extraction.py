@@ -1,9 +1,9 @@
 """Frames of a run to tracked, steady keypoints, looking no more often than the scene needs.
 
-The networks are nearly all the cost. With ``exact`` they see every frame; with the other efforts they see some, and between
-these the points of cars and people are carried by optical flow, and lanes, which have no points of their own to follow, by
-straight lines. Looks come closer together when objects grow fast, appear, vanish, or are not where flow said; a network
-that has seen nothing for a second looks twice per second.
+The networks are nearly all the cost. With ``exact`` they see every frame; with the other efforts they see some, and
+between these the points of cars and people are carried by optical flow, and lanes, which have no points of their own to
+follow, by straight lines. Looks come closer together when objects grow fast, appear, vanish, or are not where flow said;
+a network that has seen nothing for a second looks twice per second.
 """
 
 import math
@@ -48,6 +48,8 @@ EFFORTS: dict[Effort, EffortSettings] = {
     "fast": EffortSettings(max_gap=12, max_person_gap=6, max_bend=0.05, max_miss=0.05),
 }
 
+_WAITING_GAP = 4
+"""While nothing has been seen for a moment only."""
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
 """What lasts less than a quarter of a second, or was seen once, is taken for a mistake."""
@@ -131,7 +133,8 @@ class _Channel:
         self._key_frame: int | None = None
         self._paths: dict[int, list[Keypoints]] = {}
         self._previous: Callable[[], np.ndarray] | None = None
-        self._gap, self._quiet = 1, 0
+        self._gap = 1
+        self._last_seen: int | None = None
 
     def push(self, frame: np.ndarray, grey: Callable[[], np.ndarray], *, number: int, fresh: bool) -> None:
         """The next frame of the run; ``fresh`` when nothing of the one before it holds any more."""
@@ -166,10 +169,9 @@ class _Channel:
         self.looks += 1
         miss = self._close(seen, number)
         self.labels += seen
+        if seen or self._last_seen is None:
+            self._last_seen = number
         self._gap = self._next_gap(seen, miss, number)
-        self._quiet = (
-            0 if seen else self._quiet + (number - (self._key_frame if self._key_frame is not None else number))
-        )
         self._key, self._key_frame = seen, number
         self._paths = {label.track_id: [label] for label in seen}
 
@@ -191,8 +193,8 @@ class _Channel:
 
     def _next_gap(self, seen: list[Keypoints], miss: float, number: int) -> int:
         if not seen:
-            quiet = self._quiet + number - (self._key_frame if self._key_frame is not None else number)
-            return self.settings.quiet_gap if quiet >= self.settings.quiet_frames else min(self.settings.max_gap, 4)
+            quiet = number - (self._last_seen or 0) >= self.settings.quiet_frames
+            return self.settings.quiet_gap if quiet else min(self.settings.max_gap, _WAITING_GAP)
         before = {label.track_id: label for label in self._key}
         gap = float(min(self.settings.max_gap, self._gap + 2 if miss <= self.settings.max_miss else self._gap // 2))
         if set(before) != {label.track_id for label in seen}:
@@ -206,7 +208,7 @@ class _Channel:
 
 
 def _straight_gap(before: Keypoints, after: Keypoints, *, max_bend: float) -> float:
-    """How long an object may be taken to grow evenly: size goes as 1 / distance, whose bend over a gap is (r gap)^2 / 4."""
+    """How many frames an object may be taken to grow evenly: size is 1 / distance, which bends by (rate gap)^2 / 4."""
     frames = after.frame - before.frame
     rate = abs(math.log(box_diagonal(after.box_xyxy) / box_diagonal(before.box_xyxy))) / max(1, frames)
     return math.sqrt(4 * max_bend) / rate if rate > 0 else math.inf

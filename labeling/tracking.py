@@ -191,9 +191,9 @@ def assign_tracks(
 
 
 def drop_passing_tracks(labels: Sequence[Keypoints], *, min_looks: int, min_frames: int) -> list[Keypoints]:
-    """Without tracks that a network saw fewer than ``min_looks`` times, or that last less than ``min_frames``: mistakes.
+    """Without a network's mistakes: tracks of fewer than ``min_looks`` looks or ``min_frames`` frames.
 
-    What optical flow carried or a neighbour lent does not count as a look; an object without keypoints counts by its box.
+    What flow carried or a neighbour lent does not count as a look; an object without keypoints counts by its box.
     """
     looks: dict[int, int] = {}
     frames: dict[int, list[int]] = {}
