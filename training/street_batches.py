@@ -1,5 +1,6 @@
 """Batches for each street model: pool pictures, moved and disturbed, with the targets that belong to them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,7 +14,7 @@ from labeling.schemas import Category, KeypointSchema, keypoint_schema
 from training.street_augment import AugmentSettings, disturb, map_boxes, map_points, random_map
 from training.street_networks import FIELD_STRIDE
 from training.street_pool import ObjectTruth, PoolCrop, StreetPool
-from training.street_targets import encode_boxes, encode_fields, encode_responses
+from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses
 
 CLASSES: tuple[Category, ...] = ("car", "person")
 CROP_PADDING = 1.25
@@ -162,9 +163,9 @@ class FieldBatches:
     scales: tuple[float, float] = (0.9, 1.2)
 
     def __call__(self, rng: np.random.Generator) -> Batch:
-        """One batch: targets are cif and caf of each schema in turn."""
+        """One batch: targets are places and values of cif, then of caf, of each schema in turn."""
         pictures: list[np.ndarray] = []
-        targets: list[list[np.ndarray]] = []
+        targets: list[list[FieldVotes]] = []
         for index in rng.integers(0, len(self.pool.frames), self.count):
             frame, flip = self.pool.frames[index], bool(rng.random() < 0.5)
             height, width = frame.half.shape[:2]
@@ -174,11 +175,11 @@ class FieldBatches:
             disturbed = disturb(frame.half, rng, self.augment)
             pictures.append(cv2.warpAffine(disturbed, half_to_input, self.size, flags=cv2.INTER_LINEAR))
             targets.append(self._fields(frame.objects, half_to_input, flip))
-        stacked = tuple(torch.from_numpy(np.stack(field)) for field in zip(*targets, strict=True))
-        return Batch(pictures=to_input(pictures, "imagenet"), targets=stacked)
+        stacked = [tensor for votes in zip(*targets, strict=True) for tensor in _stack_votes(votes)]
+        return Batch(pictures=to_input(pictures, "imagenet"), targets=tuple(stacked))
 
-    def _fields(self, objects: tuple[ObjectTruth, ...], half_to_input: np.ndarray, flip: bool) -> list[np.ndarray]:
-        fields: list[np.ndarray] = []
+    def _fields(self, objects: tuple[ObjectTruth, ...], half_to_input: np.ndarray, flip: bool) -> list[FieldVotes]:
+        fields: list[FieldVotes] = []
         for name in self.schemas:
             table = keypoint_schema(name)
             placed = [
@@ -190,6 +191,11 @@ class FieldBatches:
             encoded = encode_fields(placed, table, columns=columns, rows=rows, stride=FIELD_STRIDE)
             fields += [encoded.cif, encoded.caf]
         return fields
+
+
+def _stack_votes(votes: Sequence[FieldVotes]) -> tuple[torch.Tensor, torch.Tensor]:
+    places = [np.insert(one.places, 0, index, axis=1) for index, one in enumerate(votes)]
+    return torch.from_numpy(np.concatenate(places)), torch.from_numpy(np.concatenate([one.values for one in votes]))
 
 
 def field_object(

@@ -72,29 +72,25 @@ def simcc_loss(
     return loss + 2 * score
 
 
-def field_loss(cif: Tensor, caf: Tensor, cif_truth: Tensor, caf_truth: Tensor) -> Tensor:
+def field_loss(field: Tensor, places: Tensor, values: Tensor) -> Tensor:
     """Focal loss of the confidences, smooth L1 of offsets and scales where there is something.
 
     Args:
-        cif: (N, K, 4, h, w) as ``FieldNetwork`` gives it; cif_truth as in ``FieldTargets``.
-        caf: (N, E, 7, h, w).
-        cif_truth: (N, K, 4, h, w).
-        caf_truth: (N, E, 7, h, w).
+        field: cif (N, K, 4, h, w) or caf (N, E, 7, h, w) as ``FieldNetwork`` gives it.
+        places: (P, 4) int64: picture, field, row, column of the cells that are not empty.
+        values: (P, 3 or 6) as in ``FieldVotes``.
     """
-    return _one_field(cif, cif_truth, vectors=1) + _one_field(caf, caf_truth, vectors=2)
-
-
-def _one_field(field: Tensor, truth: Tensor, *, vectors: int) -> Tensor:
-    confidence, target = field[:, :, 0], truth[:, :, 0]
-    positive = target > 0
-    count = positive.sum().clamp(min=1)
-    entropy = functional.binary_cross_entropy_with_logits(confidence, target.clamp(min=0), reduction="none")
+    count, width = max(1, len(places)), values.shape[1]
+    picture, row, y, x = places.T
+    confidence = field[:, :, 0].float()
+    target = torch.zeros_like(confidence)
+    target[picture, row, y, x] = 1
+    entropy = functional.binary_cross_entropy_with_logits(confidence, target, reduction="none")
     # Lin et al. 2017 with gamma 1: easy background is nearly all there is.
-    entropy = entropy * (1 - (-entropy).exp()) * (target >= 0)
-    sample, row, y, x = positive.nonzero(as_tuple=True)
-    values = field.permute(0, 1, 3, 4, 2)[sample, row, y, x]
-    wanted = truth.permute(0, 1, 3, 4, 2)[sample, row, y, x]
-    split = 1 + 2 * vectors
-    offsets = functional.smooth_l1_loss(values[:, 1:split], wanted[:, 1:split], beta=0.1, reduction="sum")
-    scales = functional.l1_loss(values[:, split:], wanted[:, split:], reduction="sum")
-    return 4 * entropy.sum() / count + (offsets + 0.2 * scales) / (vectors * count)
+    entropy = entropy * (1 - (-entropy).exp())
+    parts = torch.arange(1, 1 + width)
+    picked = field[picture[:, None], row[:, None], parts, y[:, None], x[:, None]].float()
+    offsets = 2 * width // 3
+    places_off = functional.smooth_l1_loss(picked[:, :offsets], values[:, :offsets], beta=0.1, reduction="sum")
+    scales_off = functional.l1_loss(picked[:, offsets:], values[:, offsets:], reduction="sum")
+    return 4 * entropy.sum() / count + (places_off + 0.2 * scales_off) / (width // 3 * count)

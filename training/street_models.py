@@ -109,7 +109,7 @@ def _detector_recipe(seed: int, share: float) -> Recipe:
         card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph,
         batches=lambda pool: DetectorBatches(pool=pool, size=_WINDOW, count=16, augment=AugmentSettings()),
         loss=loss,
-        fit=FitSettings(seed=seed, steps=_steps(4000, share)),
+        fit=FitSettings(seed=seed, steps=_steps(3000, share)),
     )  # fmt: skip
 
 
@@ -131,7 +131,7 @@ def _head_recipe(name: str, schema: str, seed: int, share: float) -> Recipe:
         batches=lambda pool: CropBatches(
             crops=pool.crops[category], schema=schema, size=size, count=64, augment=augment
         ),
-        fit=FitSettings(seed=seed, steps=_steps(3000, share)),
+        fit=FitSettings(seed=seed, steps=_steps(2200, share)),
     )  # fmt: skip
 
 
@@ -145,12 +145,9 @@ def _field_recipe(name: str, schemas: tuple[str, ...], seed: int, share: float) 
     columns, rows = ((side - 1) // FIELD_STRIDE + 1 for side in _FIELD_SIZE)
 
     def loss(network: nn.Module, batch: Batch) -> torch.Tensor:
-        outputs = network(batch.pictures)
-        pairs = zip(batch.targets[::2], batch.targets[1::2], strict=True)
-        losses = [
-            field_loss(cif.float(), caf.float(), *truth) for (cif, caf), truth in zip(outputs, pairs, strict=True)
-        ]
-        return torch.stack(losses).sum()
+        fields = [field for pair in network(batch.pictures) for field in pair]
+        truths = zip(fields, batch.targets[::2], batch.targets[1::2], strict=True)
+        return torch.stack([field_loss(*truth) for truth in truths]).sum()
 
     return Recipe(
         card=card, network=lambda: FieldNetwork(schemas), loss=loss,
@@ -158,7 +155,7 @@ def _field_recipe(name: str, schemas: tuple[str, ...], seed: int, share: float) 
         batches=lambda pool: FieldBatches(
             pool=pool, schemas=schemas, size=_FIELD_SIZE, count=8, augment=AugmentSettings()
         ),
-        fit=FitSettings(seed=seed, steps=_steps(2500, share)),
+        fit=FitSettings(seed=seed, steps=_steps(2000, share)),
     )  # fmt: skip
 
 

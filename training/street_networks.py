@@ -37,24 +37,27 @@ class ResidualUnit(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Stages at strides 2, 4, 8, ...; each halves the picture, then refines it with residual units."""
+    """A stem at stride 4, then stages at strides 8, 16, ...; each halves the picture and refines it with residual units.
+
+    The stem is one large convolution: at stride 2, moving memory costs more than the products. Cell i of any stage is
+    centred on input pixel i * stride.
+    """
 
     def __init__(self, widths: Sequence[int], depths: Sequence[int]) -> None:
         super().__init__()
-        stages, inputs = [], 3
-        for width, depth in zip(widths, depths, strict=True):
+        self.stem = conv_unit(3, widths[0], stride=4, kernel=7)
+        stages = []
+        for inputs, width, depth in zip(widths[:-1], widths[1:], depths, strict=True):
             units = [conv_unit(inputs, width, stride=2), *(ResidualUnit(width) for _ in range(depth))]
             stages.append(nn.Sequential(*units))
-            inputs = width
         self.stages = nn.ModuleList(stages)
 
     def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
-        """Features of every stage from stride 8 on."""
-        features = []
-        for index, stage in enumerate(self.stages):
+        """Features of every stage, finest first."""
+        x, features = self.stem(x), []
+        for stage in self.stages:
             x = stage(x)
-            if index >= 2:
-                features.append(x)
+            features.append(x)
         return features
 
 
@@ -80,10 +83,10 @@ class Pyramid(nn.Module):
 class StreetDetector(nn.Module):
     """A YOLOX-like detector: one prediction per cell of strides 8, 16 and 32, one head shared by all of them."""
 
-    def __init__(self, classes: int, *, widths: Sequence[int] = (16, 24, 40, 72, 112), width: int = 48) -> None:
+    def __init__(self, classes: int, *, widths: Sequence[int] = (24, 40, 72, 112), width: int = 48) -> None:
         super().__init__()
-        self.trunk = Trunk(widths, (0, 0, 1, 1, 1))
-        self.pyramid = Pyramid(widths[2:], width)
+        self.trunk = Trunk(widths, (1, 1, 1))
+        self.pyramid = Pyramid(widths[1:], width)
         self.tower = nn.ModuleList(conv_unit(width, width) for _ in DETECTOR_STRIDES)
         self.head = nn.Conv2d(width, 5 + classes, 1)
         # A cell holds an object about once in a hundred (Lin et al. 2017, focal loss).
@@ -115,20 +118,20 @@ class SimccNetwork(nn.Module):
     Args:
         schema: keypoint schema, K points.
         size: input width and height; each a multiple of 16.
-        widths: channels at strides 2, 4, 8 and 16.
+        widths: channels at strides 4, 8 and 16.
     """
 
-    def __init__(self, schema: str, size: tuple[int, int], *, widths: Sequence[int] = (16, 32, 56, 88)) -> None:
+    def __init__(self, schema: str, size: tuple[int, int], *, widths: Sequence[int] = (32, 56, 88)) -> None:
         super().__init__()
         points = keypoint_schema(schema).point_count
         cells = (size[0] // 8) * (size[1] // 8)
-        self.trunk = Trunk(widths, (0, 1, 2, 2))
-        self.pyramid = Pyramid(widths[2:], widths[2])
-        self.points = nn.Conv2d(widths[2], points, 1)
+        self.trunk = Trunk(widths, (2, 2))
+        self.pyramid = Pyramid(widths[1:], widths[1])
+        self.points = nn.Conv2d(widths[1], points, 1)
         self.along_x = nn.Linear(cells, 2 * size[0])
         self.along_y = nn.Linear(cells, 2 * size[1])
         self.seen_locally = nn.Linear(cells, 1)
-        self.seen_globally = nn.Linear(widths[3], points)
+        self.seen_globally = nn.Linear(widths[2], points)
 
     def forward(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """(N, 3, H, W) normalised RGB to logits (N, K, 2 W), (N, K, 2 H) and visibility logits (N, K)."""
@@ -159,13 +162,11 @@ def _peak_one(logits: torch.Tensor) -> torch.Tensor:
 class FieldNetwork(nn.Module):
     """Composite intensity and association fields at stride 8 for one or more schemas (Kreiss et al. 2019)."""
 
-    def __init__(
-        self, schemas: Sequence[str], *, widths: Sequence[int] = (16, 24, 40, 72, 112), width: int = 64
-    ) -> None:
+    def __init__(self, schemas: Sequence[str], *, widths: Sequence[int] = (24, 40, 72, 112), width: int = 48) -> None:
         super().__init__()
         self.tables = [keypoint_schema(name) for name in schemas]
-        self.trunk = Trunk(widths, (0, 0, 1, 1, 2))
-        self.pyramid = Pyramid(widths[2:], width)
+        self.trunk = Trunk(widths, (1, 1, 2))
+        self.pyramid = Pyramid(widths[1:], width)
         self.context = ResidualUnit(width)
         self.cif = nn.ModuleList(nn.Conv2d(width, 4 * table.point_count, 1) for table in self.tables)
         self.caf = nn.ModuleList(nn.Conv2d(width, 7 * len(table.edges), 1) for table in self.tables)

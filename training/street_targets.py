@@ -29,13 +29,21 @@ class GridTargets:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FieldVotes:
+    """The cells of one kind of field that have something to say; all others are empty."""
+
+    places: np.ndarray
+    """(P, 3) int64: field, row, column; each at most once."""
+    values: np.ndarray
+    """(P, 3 or 6) float32: offsets x, y in cells of the point or of both ends, then log scales in cells."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FieldTargets:
     """One schema's fields in one picture."""
 
-    cif: np.ndarray
-    """(K, 4, h, w) float32: confidence (-1 not counted), x and y offset in cells, log scale in cells."""
-    caf: np.ndarray
-    """(E, 7, h, w) float32: confidence (-1 not counted), both ends' offsets, both log scales."""
+    cif: FieldVotes
+    caf: FieldVotes
 
 
 def grid_cells(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
@@ -117,45 +125,56 @@ def encode_fields(
         rows: h.
         stride: input pixels per cell; cell i lies at pixel i * stride.
     """
-    cif = np.zeros((table.point_count, 4, rows, columns), np.float32)
-    caf = np.zeros((len(table.edges), 7, rows, columns), np.float32)
-    nearest = np.full((table.point_count, rows, columns), np.inf, np.float32)
-    for points, present, scales in objects:
+    shape = (rows, columns)
+    edges = np.array(table.edges)
+    cif, caf = [np.zeros((0, 7))], [np.zeros((0, 10))]
+    for rank, (points, present, scales) in enumerate(objects):
         cells, log_scales = points / stride, np.log(np.maximum(scales / stride, 1e-3))
-        for k in np.flatnonzero(present):
-            _vote_point(cif[k], nearest[k], cells[k], log_scales[k])
-        for e, (a, b) in enumerate(table.edges):
-            if present[a] and present[b]:
-                _vote_edge(caf[e], cells[a], cells[b], (log_scales[a], log_scales[b]))
-    return FieldTargets(cif=cif, caf=caf)
+        cif.append(_point_votes(cells, present, log_scales))
+        caf.append(_edge_votes(cells, edges[present[edges].all(axis=1)], edges, log_scales, rank))
+    return FieldTargets(cif=_settle(np.concatenate(cif), shape), caf=_settle(np.concatenate(caf), shape))
 
 
-def _vote_point(field: np.ndarray, nearest: np.ndarray, cell_xy: np.ndarray, log_scale: float) -> None:
-    rows, columns = nearest.shape
-    left, top = (int(value) for value in np.floor(cell_xy - (_FIELD_WINDOW / 2 - 1)))
-    bottom, right = min(top + _FIELD_WINDOW, rows), min(left + _FIELD_WINDOW, columns)
-    window = (slice(max(top, 0), bottom), slice(max(left, 0), right))
-    if bottom <= 0 or right <= 0 or not nearest[window].size:
-        return
-    y, x = np.mgrid[window]
-    off_x, off_y = cell_xy[0] - x, cell_xy[1] - y
-    distance = np.hypot(off_x, off_y)
+def _point_votes(cells_xy: np.ndarray, present: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    """(V, 7) votes of the cells around each point: cost, field, x, y, then offset x and y and log scale."""
+    window = np.stack(np.meshgrid(np.arange(_FIELD_WINDOW), np.arange(_FIELD_WINDOW)), axis=2).reshape(-1, 2)
+    chosen = np.flatnonzero(present)
+    corners = np.floor(cells_xy[chosen] - (_FIELD_WINDOW / 2 - 1))
+    places = corners[:, None] + window
+    offsets = cells_xy[chosen, None] - places
     # Two objects' points share cells: each cell votes for the nearer.
-    wins = distance < nearest[window]
-    values = np.stack([np.ones_like(off_x), off_x, off_y, np.full_like(off_x, log_scale)])
-    field[(slice(None), *window)] = np.where(wins, values, field[(slice(None), *window)])
-    nearest[window] = np.minimum(nearest[window], distance)
+    cost = np.hypot(*np.moveaxis(offsets, 2, 0))[..., None]
+    names = np.broadcast_to(chosen[:, None, None], cost.shape)
+    scale = np.broadcast_to(log_scales[chosen][:, None, None], cost.shape)
+    return np.concatenate([cost, names, places, offsets, scale], axis=2).reshape(-1, 7)
 
 
-def _vote_edge(field: np.ndarray, a: np.ndarray, b: np.ndarray, log_scales: tuple[float, float]) -> None:
-    rows, columns = field.shape[1:]
-    steps = max(2, int(np.ceil(2 * np.hypot(*(b - a)))) + 1)
-    line = a + np.linspace(0, 1, steps)[:, None] * (b - a)
-    corners = np.floor(line).astype(int)
-    cells = np.unique(np.concatenate([corners + shift for shift in ((0, 0), (1, 0), (0, 1), (1, 1))]), axis=0)
-    cells = cells[((cells >= 0) & (cells < (columns, rows))).all(axis=1)]
-    x, y = cells.T
-    field[0, y, x] = 1
-    field[1:3, y, x] = (a - cells).T
-    field[3:5, y, x] = (b - cells).T
-    field[5, y, x], field[6, y, x] = log_scales
+def _edge_votes(
+    cells_xy: np.ndarray, chosen: np.ndarray, edges: np.ndarray, log_scales: np.ndarray, rank: int
+) -> np.ndarray:
+    """(V, 10) votes of the cells along each edge: cost, field, x, y, then both ends' offsets and log scales."""
+    if not len(chosen):
+        return np.zeros((0, 10))
+    start, end = cells_xy[chosen[:, 0]], cells_xy[chosen[:, 1]]
+    steps = int(np.ceil(2 * np.hypot(*(end - start).T).max())) + 2
+    line = start[:, None] + np.linspace(0, 1, steps)[:, None] * (end - start)[:, None]
+    corners = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
+    places = (np.floor(line)[:, :, None] + corners).reshape(len(chosen), -1, 2)
+    index = {pair: field for field, pair in enumerate(map(tuple, edges.tolist()))}
+    names = np.array([index[pair] for pair in map(tuple, chosen.tolist())], float)
+    one = np.ones((*places.shape[:2], 1))
+    ends = [start[:, None] - places, end[:, None] - places]
+    scales = [one * log_scales[chosen[:, side]][:, None, None] for side in (0, 1)]
+    return np.concatenate([-rank * one, names[:, None, None] * one, places, *ends, *scales], axis=2).reshape(-1, 10)
+
+
+def _settle(votes: np.ndarray, shape: tuple[int, int]) -> FieldVotes:
+    """The cheapest vote of every cell inside the fields."""
+    rows, columns = shape
+    field, x, y = votes[:, 1:4].astype(np.int64).T
+    inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+    votes, places = votes[inside], np.stack([field, y, x], axis=1)[inside]
+    order = np.argsort(votes[:, 0], kind="stable")
+    flat = np.ravel_multi_index(tuple(places[order].T), (int(field.max(initial=0)) + 1, rows, columns))
+    first = order[np.unique(flat, return_index=True)[1]]
+    return FieldVotes(places=places[first], values=votes[first, 4:].astype(np.float32))
