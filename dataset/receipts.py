@@ -121,10 +121,14 @@ def storage_errors(path: Path) -> Any:
         raise mapped from error
 
 
+def host_name() -> str:
+    """This host, in letters that a file name may have."""
+    return re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
+
+
 def worker_name() -> str:
     """A log name that no other process has: host, process, start."""
-    host = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
-    return f"{host}-{os.getpid()}-{time.time_ns():x}"
+    return f"{host_name()}-{os.getpid()}-{time.time_ns():x}"
 
 
 class ReceiptLog:

@@ -17,6 +17,7 @@ from labeling.camera import Intrinsics, Trajectory
 from labeling.errors import DataError
 from labeling.labels import Keypoints
 from labeling.schemas import Category
+from labeling.timeline import RunFrames
 
 if TYPE_CHECKING:
     from labeling.ego_motion import EgoMotion
@@ -156,32 +157,16 @@ def read_index(path: Path) -> VideoIndex:
     )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameTable:
-    """The frames of one run."""
-
-    frame: np.ndarray
-    """(N,) int32, consecutive, on the video's grid."""
-    source_time_s: np.ndarray
-    """(N,) float64, presentation time of the source frame that is shown."""
-    duplicate: np.ndarray
-    """(N,) bool: shows the same source frame as the one before."""
-    hole: np.ndarray
-    """(N,) bool: the source has no frame here."""
-    cut: np.ndarray
-    """(N,) bool: a hard cut lies between the frame before and this one."""
-
-
-def write_frames(path: Path, frames: FrameTable) -> None:
+def write_frames(path: Path, frames: RunFrames) -> None:
     """Write a run's frame table."""
     arrays = [pa.array(getattr(frames, field.name), field.type) for field in FRAMES_SCHEMA]
     write_table(path, pa.Table.from_arrays(arrays, schema=FRAMES_SCHEMA))
 
 
-def read_frames_table(path: Path) -> FrameTable:
+def read_frames_table(path: Path) -> RunFrames:
     """A run's frame table."""
     table, _ = read_table(path, FRAMES_SCHEMA)
-    return FrameTable(**{name: _column(table, name) for name in FRAMES_SCHEMA.names})
+    return RunFrames(**{name: _column(table, name) for name in FRAMES_SCHEMA.names})
 
 
 def write_keypoints(path: Path, labels: Sequence[Keypoints], *, metadata: Mapping[str, Any] | None = None) -> None:

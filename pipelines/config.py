@@ -136,9 +136,9 @@ class Config(Settings):
     @model_validator(mode="after")
     def _strides_fall_on_keyframes(self) -> "Config":
         for name, encoder in (("encoder", self.encoder), ("views.skeleton_encoder", self.views.skeleton_encoder)):
-            if self.clip.stride_frames % encoder.gop_frames or self.clip.run_frames % self.clip.stride_frames:
+            if self.clip.stride_frames % encoder.gop or self.clip.run_frames % self.clip.stride_frames:
                 raise ValueError(
-                    f"{name}.gop_frames {encoder.gop_frames} must divide clip.stride_frames {self.clip.stride_frames}, "
+                    f"{name}.gop {encoder.gop} must divide clip.stride_frames {self.clip.stride_frames}, "
                     f"and that clip.run_frames {self.clip.run_frames}: clips are cut at keyframes"
                 )
         return self

@@ -21,6 +21,7 @@ from dataset.receipts import (
     Receipt,
     ReceiptLog,
     digest,
+    host_name,
     publish,
     storage_error,
     storage_errors,
@@ -53,7 +54,7 @@ def perform(root: Path, task: Task, log: ReceiptLog) -> Receipt:
     A receipt that cannot itself be written comes back as a retryable failure.
     """
     item, started = task.item, time.perf_counter()
-    staging = root / ".staging" / item.stage / item.name.replace("/", ".")
+    staging = root / ".staging" / f"{item.stage}.{item.name.replace('/', '.')}.{host_name()}-{os.getpid()}"
     base = _base_receipt(task)
     try:
         base = _make(root, task, staging, log)
@@ -87,6 +88,26 @@ def _make(root: Path, task: Task, staging: Path, log: ReceiptLog) -> Receipt:
         base = replace(base, turn=base.turn + 1)
     outputs: tuple[Output, ...] = publish(staging, root, item.outputs)
     return replace(base, outputs=outputs, facts=dict(facts))
+
+
+def sweep_staging(root: Path) -> None:
+    """Remove what dead processes of this host left half-made; other hosts' process numbers may live, so theirs stay."""
+    for folder in (root / ".staging").glob("*"):
+        host, _, process = folder.name.rpartition(".")[2].rpartition("-")
+        if host == host_name() and not _alive(int(process)):
+            shutil.rmtree(folder, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        (root / ".staging").rmdir()
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def _base_receipt(task: Task) -> Receipt:
@@ -124,6 +145,7 @@ class Engine:
         self._root, self._count = root, workers
         self._workers: list[_Worker] = []
         self._name = worker_name()
+        sweep_staging(root)
 
     def __enter__(self) -> "Engine":
         return self
@@ -132,9 +154,7 @@ class Engine:
         for worker in self._workers:
             worker.stop()
         self._workers.clear()
-        for folder in (*(self._root / ".staging").glob("*"), self._root / ".staging"):
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+        sweep_staging(self._root)
 
     def run(self, tasks: Sequence[Task]) -> Iterator[Receipt]:
         """Work on every task and yield receipts as they come, in no order.

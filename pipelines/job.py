@@ -32,17 +32,21 @@ class Source:
 class Job:
     """A job's folder with what ``job.yaml`` says; plans and receipts are read once until ``refresh``."""
 
-    def __init__(self, root: Path, config: Config, sources: Mapping[str, Source]) -> None:
-        self.root, self.config = root, config
+    def __init__(
+        self, root: Path, config: Config, sources: Mapping[str, Source], *, models_dir: Path | None = None
+    ) -> None:
+        self.root, self.config, self.models_dir = root, config, models_dir
         self.sources: dict[str, Source] = dict(sorted(sources.items()))
         self.selection_mode: str = "auto"
         self._plans: dict[str, list[WorkItem]] = {}
         self._receipts: dict[str, dict[str, Receipt]] = {}
+        self._settled: dict[str, dict[str, Receipt]] = {}
 
     def refresh(self) -> None:
         """Forget plans and receipts: a stage has run, here or elsewhere."""
         self._plans.clear()
         self._receipts.clear()
+        self._settled.clear()
 
     def plan(self, stage: str) -> list[WorkItem]:
         """The items of a stage.
@@ -62,9 +66,13 @@ class Job:
 
     def settled(self, stage: str) -> dict[str, Receipt]:
         """Up-to-date receipts of a stage's planned items, whatever their state; failures to be retried included."""
-        known = self.receipts(stage)
-        states = {item.name: item_state(item, known.get(item.name), self.root) for item in self.plan(stage)}
-        return {name: known[name] for name, state in states.items() if state in ("current", "retry")}
+        if stage not in self._settled:
+            known = self.receipts(stage)
+            states = {item.name: item_state(item, known.get(item.name), self.root) for item in self.plan(stage)}
+            self._settled[stage] = {
+                name: known[name] for name, state in states.items() if state in ("current", "retry")
+            }
+        return self._settled[stage]
 
     def done(self, stage: str) -> dict[str, Receipt]:
         """Up-to-date receipts of a stage's items that are done."""
@@ -85,6 +93,8 @@ class Job:
             "config": self.config.model_dump(mode="json", exclude_defaults=True),
             "videos": {name: _source_values(source) for name, source in self.sources.items()},
         }
+        if self.models_dir:
+            values["models"] = str(self.models_dir)
         data = yaml.safe_dump(values, sort_keys=True, allow_unicode=True, width=120).encode()
         path = self.root / "job.yaml"
         if not (path.is_file() and path.read_bytes() == data):
@@ -109,11 +119,16 @@ def open_job(root: Path) -> Job:
         )
         for name, entry in (values.get("videos") or {}).items()
     }
-    return Job(root, parse_config(values.get("config") or {}, str(path)), sources)
+    models = values.get("models")
+    return Job(
+        root, parse_config(values.get("config") or {}, str(path)), sources, models_dir=Path(models) if models else None
+    )
 
 
-def open_or_create(root: Path, *, config: Config | None, videos: Sequence[Source]) -> Job:
-    """The job in ``root`` with ``videos`` added and, where given, another configuration. Nothing is written yet.
+def open_or_create(
+    root: Path, *, videos: Sequence[Source] = (), config: Config | None = None, models_dir: Path | None = None
+) -> Job:
+    """The job in ``root`` with ``videos`` added and, where given, other settings and models. Nothing is written yet.
 
     Raises:
         ConfigError: a video has the id of another one, or no job and no videos.
@@ -127,7 +142,8 @@ def open_or_create(root: Path, *, config: Config | None, videos: Sequence[Source
         sources[source.video_id] = source
     if not sources:
         raise ConfigError(f"{root}: holds no job and no videos were given; name some VIDEO files or folders")
-    return Job(root, config or (known.config if known else Config()), sources)
+    models_dir = models_dir.absolute() if models_dir else (known.models_dir if known else None)
+    return Job(root, config or (known.config if known else Config()), sources, models_dir=models_dir)
 
 
 def find_videos(arguments: Sequence[Path], *, leave_out: Path | None = None) -> list[Source]:

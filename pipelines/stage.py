@@ -24,6 +24,7 @@ STAGES: dict[str, str] = {
     "skeleton": "pipelines.stages_views:SkeletonStage",
     "render": "pipelines.stages_views:RenderStage",
     "pack": "pipelines.stages_pack:PackStage",
+    "shards": "pipelines.stages_pack:ShardIndexStage",
 }
 """Where each stage lives, in the order in which they run. Nothing is imported before it is asked for."""
 
@@ -35,7 +36,7 @@ COMMAND_STAGES: dict[str, tuple[str, ...]] = {
     "keypoints": ("keypoints",),
     "ego": ("ego",),
     "render": ("skeleton", "render"),
-    "pack": ("pack",),
+    "pack": ("pack", "shards"),
 }
 """What a person calls a stage, and what runs for it."""
 

@@ -1,0 +1,149 @@
+"""The command line. Commands import what they run when they are called, so that ``animatic --help`` answers at once."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    name="animatic",
+    help="Motion Appearance Decoupling for driving world models: raw driving videos in, two trained adapters out.",
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich",
+)  # fmt: skip
+
+LABEL, STAGES, LOOK, TRAIN, MEASURE = "Label videos", "Single stages", "Look", "Train and sample", "Measure"
+
+Videos = Annotated[list[Path], typer.Argument(help="Video files, folders of them, or text files of paths.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="The job's folder.")]
+JobFolder = Annotated[Path, typer.Argument(help="The job's folder.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Settings in YAML.")]
+Effort = Annotated[str | None, typer.Option("--effort", help="fast, balanced or exact.")]
+KeepShare = Annotated[float | None, typer.Option(help="Share of the clips to keep, by objects; 1 keeps every clip.")]
+Models = Annotated[Path | None, typer.Option("--models", help="Folder of ONNX weights.")]
+Extractors = Annotated[
+    str | None, typer.Option(help="Model cards by name, with commas; 'street' for the shipped ones.")
+]
+Workers = Annotated[int | None, typer.Option(min=0, help="Processes; by default one per core.")]
+PartOf = Annotated[str | None, typer.Option("--part", help="i/n: this host's share of the videos.")]
+LeaveOut = Annotated[Path | None, typer.Option(help="CSV of video_id,start_s,end_s: seconds to leave out at each end.")]
+Wait = Annotated[float, typer.Option(help="Minutes to wait for other parts that make no progress.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def main() -> None:
+    """Entry point: a person sees one line and exit code 2 for what they can mend, never a traceback."""
+    from labeling.errors import AnimaticError
+
+    try:
+        app()
+    except AnimaticError as error:
+        from pipelines.console import print_error
+
+        print_error(error)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("stopped; run the same command again to go on", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+@app.command(rich_help_panel=LABEL)
+def label(
+    videos: Videos,
+    out: Out,
+    config: ConfigFile = None,
+    effort: Effort = None,
+    keep_share: KeepShare = None,
+    models: Models = None,
+    extractors: Extractors = None,
+    workers: Workers = None,
+    part: PartOf = None,
+    leave_out: LeaveOut = None,
+    videos_kept: Annotated[str | None, typer.Option("--videos", help="all, or rgb to pack without the views.")] = None,
+    captions: Annotated[Path | None, typer.Option(help="Table of key and text; other clips get the template.")] = None,
+    split: Annotated[Path | None, typer.Option(help="CSV of video_id,split instead of the hash.")] = None,
+    wait: Wait = 10.0,
+) -> None:
+    """Raw videos to packed, labelled clips: index, count, select, cut, keypoints, ego, render, pack."""
+    from pipelines.commands import JobOptions, run_label
+
+    options = JobOptions(
+        config=config, effort=effort, keep_share=keep_share, models=models, extractors=extractors, videos=videos_kept,
+        captions=captions, split=split, leave_out=leave_out, workers=workers, part=part, wait_minutes=wait,
+    )  # fmt: skip
+    raise typer.Exit(run_label(videos, out, options))
+
+
+@app.command(name="slice", rich_help_panel=LABEL)
+def slice_videos(
+    videos: Videos,
+    out: Out,
+    config: ConfigFile = None,
+    workers: Workers = None,
+    part: PartOf = None,
+    leave_out: LeaveOut = None,
+    wait: Wait = 10.0,
+) -> None:
+    """Index and cut, with every clip kept: the 24 fps runs alone."""
+    from pipelines.commands import JobOptions, run_slice
+
+    options = JobOptions(
+        config=config, keep_share=1.0, workers=workers, part=part, leave_out=leave_out, wait_minutes=wait
+    )
+    raise typer.Exit(run_slice(videos, out, options))
+
+
+def _stage_command(name: str, text: str) -> None:
+    def command(out: Out, workers: Workers = None, part: PartOf = None) -> None:
+        from pipelines.commands import run_single
+
+        raise typer.Exit(run_single(name, out, workers=workers, part=part))
+
+    command.__doc__ = text
+    app.command(name=name, rich_help_panel=STAGES)(command)
+
+
+@app.command(rich_help_panel=STAGES)
+def index(
+    out: Out, videos: Annotated[list[Path] | None, typer.Argument()] = None, config: ConfigFile = None,
+    models: Models = None, keep_share: KeepShare = None, extractors: Extractors = None, leave_out: LeaveOut = None,
+    workers: Workers = None, part: PartOf = None,
+) -> None:  # fmt: skip
+    """Presentation times and keyframes of every video; packets only, nothing is decoded."""
+    from pipelines.commands import JobOptions, run_index
+
+    options = JobOptions(
+        config=config, keep_share=keep_share, models=models, extractors=extractors, leave_out=leave_out,
+        workers=workers, part=part,
+    )  # fmt: skip
+    raise typer.Exit(run_index(videos or [], out, options))
+
+
+_stage_command("count", "Objects per clip, on the videos' own keyframes.")
+
+
+@app.command(rich_help_panel=STAGES)
+def select(
+    out: Out,
+    extend: Annotated[bool, typer.Option("--extend", help="Judge added videos by the frozen threshold.")] = False,
+    refreeze: Annotated[bool, typer.Option("--refreeze", help="Compute threshold, sample and split anew.")] = False,
+    workers: Workers = None,
+) -> None:
+    """Keep the clips with the most objects; split and sample. The one barrier: every part must have counted."""
+    from pipelines.commands import run_select
+
+    raise typer.Exit(run_select(out, extend=extend, refreeze=refreeze, workers=workers))
+
+
+for _name, _text in (
+    ("cut", "The 24 fps runs around kept clips; each frame decoded and encoded once."),
+    ("keypoints", "Keypoints and tracks of every run."),
+    ("ego", "The camera's trajectory over every run."),
+    ("render", "Skeleton, ego and object videos, and captions."),
+    ("pack", "Shards and their index."),
+):
+    _stage_command(_name, _text)

@@ -1,0 +1,191 @@
+"""What the labelling commands do: settings from options, a job, its stages, and an exit code."""
+
+import csv
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dataset.receipts import Receipt, storage_errors
+from dataset.selection import read_selection
+from labeling.errors import ConfigError
+from labeling.extractors import Extractors
+from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, with_effort
+from pipelines.console import ConsoleReporter, print_failures
+from pipelines.engine import Engine
+from pipelines.job import Job, find_videos, open_job, open_or_create
+from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages
+from pipelines.layout import SELECTION
+from pipelines.stage import COMMAND_STAGES, Part, parse_part
+from pipelines.stages_select import NO_DETECTOR, job_extractors
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobOptions:
+    """Options as a person gave them; what is None stays as the job has it."""
+
+    config: Path | None = None
+    effort: str | None = None
+    keep_share: float | None = None
+    models: Path | None = None
+    extractors: str | None = None
+    videos: str | None = None
+    captions: Path | None = None
+    split: Path | None = None
+    leave_out: Path | None = None
+    workers: int | None = None
+    part: str | None = None
+    wait_minutes: float = 0.0
+
+
+def run_label(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
+    """The main job; 0, or 1 where something failed.
+
+    Raises:
+        AnimaticError: something a person can mend before anything is spent.
+    """
+    reporter = ConsoleReporter()
+    job = prepare_job(videos, out, options)
+    check_extractors(job, reporter)
+    reports = run_job(job, ALL_STAGES, options, reporter)
+    return _finish(job, reports, reporter)
+
+
+def run_slice(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
+    """Index and cut with every clip kept; 0, or 1 where something failed."""
+    reporter = ConsoleReporter()
+    job = prepare_job(videos, out, options)
+    return _finish(job, run_job(job, SLICE_STAGES, options, reporter), reporter)
+
+
+def run_index(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
+    """Index, on a new job or one that is there; 0, or 1 where something failed."""
+    reporter = ConsoleReporter()
+    job = prepare_job(videos, out, options)
+    return _finish(job, run_job(job, COMMAND_STAGES["index"], options, reporter), reporter)
+
+
+def run_single(stage: str, out: Path, *, workers: int | None = None, part: str | None = None) -> int:
+    """One stage of a job that is there; 0, or 1 where something failed."""
+    reporter = ConsoleReporter()
+    options = JobOptions(workers=workers, part=part)
+    job = open_job(out)
+    return _finish(job, run_job(job, COMMAND_STAGES[stage], options, reporter), reporter)
+
+
+def run_select(out: Path, *, extend: bool = False, refreeze: bool = False, workers: int | None = None) -> int:
+    """Select, extend or select anew; 0, or 1 where something failed."""
+    if extend and refreeze:
+        raise ConfigError("--extend keeps the threshold and --refreeze computes it anew; give one of them")
+    reporter = ConsoleReporter()
+    job = open_job(out)
+    job.selection_mode = "extend" if extend else "refreeze" if refreeze else "auto"
+    with Engine(job.root, workers=0 if workers is None else workers) as engine:
+        reports = run_stages(job, ("select",), engine, reporter, refreeze=refreeze or extend)
+    if reports[-1].failed and reports[-1].failed[0].reason == ConfigError.reason:
+        raise ConfigError(reports[-1].failed[0].message)
+    return _finish(job, reports, reporter)
+
+
+def prepare_job(videos: Sequence[Path], out: Path, options: JobOptions) -> Job:
+    """The job with its settings and videos, written to ``job.yaml``.
+
+    Raises:
+        AnimaticError: settings, videos or a folder that cannot be used.
+    """
+    sources = find_videos(videos, leave_out=options.leave_out) if videos else []
+    job = open_or_create(out, videos=sources, models_dir=options.models)
+    config = configured(job.config, options)
+    job = Job(job.root.absolute(), config, job.sources, models_dir=job.models_dir)
+    if options.models is not None and not options.models.is_dir():
+        raise ConfigError(f"--models {options.models}: is no folder; give the folder that holds the ONNX files")
+    with storage_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    job.save()
+    return job
+
+
+def configured(config: Config, options: JobOptions) -> Config:
+    """Settings with a person's options on top.
+
+    Raises:
+        ConfigError: an option that no setting allows.
+    """
+    if options.config is not None:
+        config = parse_config(read_yaml(options.config), str(options.config))
+    if options.effort is not None:
+        if options.effort not in EFFORTS:
+            raise ConfigError(f"--effort {options.effort!r} is not known; choose one of {', '.join(EFFORTS)}")
+        config = with_effort(config, next(effort for effort in EFFORTS if effort == options.effort))
+    changes: dict[str, Any] = {}
+    if options.keep_share is not None:
+        changes["select"] = {"keep_share": options.keep_share}
+    if options.split is not None:
+        changes.setdefault("select", {})["split"] = read_split(options.split)
+    if options.extractors is not None:
+        names = [name.strip() for name in options.extractors.split(",") if name.strip()]
+        changes["keypoints"] = {"extractors": names}
+    if options.videos is not None:
+        changes["pack"] = {"videos": options.videos}
+    if options.captions is not None:
+        changes["views"] = {"captions": str(options.captions.absolute())}
+    return merged(config, changes) if changes else config
+
+
+def read_split(path: Path) -> dict[str, str]:
+    """Split by video id, from a CSV table with the columns ``video_id, split``.
+
+    Raises:
+        ConfigError: it cannot be read, or lacks a column.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            return {row["video_id"]: row["split"] for row in csv.DictReader(stream)}
+    except (OSError, KeyError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path}: cannot be read as video_id,split ({error}); mend the table") from error
+
+
+def check_extractors(job: Job, reporter: ConsoleReporter) -> None:
+    """Open every network once before anything is spent, and say what is left out.
+
+    Raises:
+        ConfigError: no detector, though clips are to be ranked by what they show.
+        ModelError: weights that break their card's contract.
+    """
+    choice = job_extractors(job)
+    detector = job.config.count.detector or choice.detector
+    if detector is None and job.config.select.keep_share < 1:
+        raise ConfigError(NO_DETECTOR)
+    settings = job.config.keypoints
+    opened = Extractors(choice, models_dir=job.models_dir, providers=settings.providers, threads=settings.threads)
+    used = ", ".join(card.name for card in opened.choice.cards) or "none"
+    reporter.console.print(f"[bold]{'models':>10}[/] {used}; providers {', '.join(settings.providers)}")
+    if choice.missing_categories:
+        reporter.console.print(
+            f"{'':>10} no keypoints of {', '.join(choice.missing_categories)}: no weights for "
+            f"{', '.join(choice.absent) or 'them'} (`animatic models` says how to get them)"
+        )
+
+
+def run_job(job: Job, stages: Sequence[str], options: JobOptions, reporter: ConsoleReporter) -> list[StageReport]:
+    """Run stages on the local pool."""
+    part = parse_part(options.part) if options.part else Part()
+    workers = options.workers if options.workers is not None else max(1, os.cpu_count() or 1)
+    with Engine(job.root, workers=workers) as engine:
+        return run_stages(job, stages, engine, reporter, part=part, patience_s=options.wait_minutes * 60)
+
+
+def _finish(job: Job, reports: Sequence[StageReport], reporter: ConsoleReporter) -> int:
+    failed: list[Receipt] = [receipt for report in reports for receipt in report.failed]
+    print_failures(failed, reporter.console)
+    selected = any(report.stage == "select" for report in reports)
+    if selected and (job.root / SELECTION).is_file():
+        selection = read_selection(job.root / SELECTION)
+        if not selection.kept:
+            reasons = sorted({row.reason for row in selection.rows if row.reason})
+            reporter.console.print(f"[red]no clip is left:[/] {'; '.join(reasons[:3]) or 'no video could be read'}")
+            return 1
+    if any(report.stage == "shards" for report in reports) and not failed:
+        reporter.console.print(f"{'':>10} look at it with `animatic inspect {job.root}`")
+    return 1 if failed else 0

@@ -1,0 +1,108 @@
+"""What a person sees: a progress bar per stage, one line for each failure, and numbers in readable units."""
+
+import sys
+import time
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from dataset.receipts import Receipt, reason_counts
+from pipelines.label import StageReport
+
+
+def make_console(*, stderr: bool = False) -> Console:
+    """A console that never wraps what a script may want to read."""
+    return Console(stderr=stderr, highlight=False, soft_wrap=True)
+
+
+class ConsoleReporter:
+    """Shows stages as they run: bars on a terminal, a line per stage elsewhere."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self.console = console or make_console()
+        self._progress: Progress | None = None
+        self._task: TaskID | None = None
+        self._notice = ("", 0.0)
+
+    def stage_started(self, stage: str, *, items: int, weight: float, current: int) -> None:
+        """Open the stage's bar."""
+        if items == 0 or not self.console.is_terminal:
+            return
+        self._progress = Progress(
+            TextColumn("{task.description:>10}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn(),
+            console=self.console, transient=True,
+        )  # fmt: skip
+        self._progress.start()
+        self._task = self._progress.add_task(stage, total=items)
+
+    def item_finished(self, receipt: Receipt, *, weight: float) -> None:
+        """Move the bar; a failure is shown at once."""
+        if receipt.state == "failed":
+            self.console.print(f"[red]{receipt.stage:>10}[/] {receipt.item}: {escape(receipt.message)}")
+        if self._progress is not None and self._task is not None:
+            self._progress.advance(self._task)
+
+    def stage_finished(self, report: StageReport) -> None:
+        """One line that says what came of it."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+        if report.stage in ("source", "shards") and not report.failed:
+            return
+        words = [f"{report.count('done')} done"]
+        dropped = reason_counts(receipt.reason for receipt in report.made if receipt.state == "dropped")
+        words += [f"{count} dropped ({reason})" for reason, count in dropped.items()]
+        words += [f"[red]{len(report.failed)} failed[/]"] if report.failed else []
+        words += [f"{report.current} up to date"] if report.current else []
+        self.console.print(f"[bold]{report.stage:>10}[/] {', '.join(words)} [dim]({duration(report.seconds)})[/]")
+
+    def waiting(self, message: str) -> None:
+        """Say once a minute what is waited for."""
+        text, at = self._notice
+        if text != message or time.monotonic() - at > 60:
+            self.console.print(f"[yellow]waiting[/] {escape(message)}")
+            self._notice = (message, time.monotonic())
+
+
+def print_error(error: Exception) -> None:
+    """One line on standard error."""
+    make_console(stderr=True).print(f"[bold red]error:[/] {escape(' '.join(str(error).split()))}")
+
+
+def print_failures(failed: Sequence[Receipt], console: Console) -> None:
+    """Which items failed, and why."""
+    if not failed:
+        return
+    table = Table(title=f"{len(failed)} failed", title_style="bold red", title_justify="left", box=None, pad_edge=False)
+    for column in ("stage", "item", "reason", "again?"):
+        table.add_column(column, style="dim" if column == "stage" else "")
+    for receipt in failed:
+        again = "run again" if receipt.retryable else "no"
+        table.add_row(receipt.stage, receipt.item, escape(receipt.message), again)
+    console.print(table)
+
+
+def duration(seconds: float) -> str:
+    """Seconds in a person's units."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    if seconds < 3600:
+        return f"{seconds / 60:.1f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def file_size(size: float) -> str:
+    """Bytes in a person's units, powers of 1000."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 999.5:
+            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} TB"
+
+
+def is_interactive() -> bool:
+    """Whether a person looks at standard output."""
+    return sys.stdout.isatty()

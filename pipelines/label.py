@@ -1,0 +1,154 @@
+"""The main job: stages in order over a job's items, skipping what receipts say is done."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from dataset.receipts import Receipt
+from labeling.errors import StorageError
+from pipelines.engine import Engine, Task
+from pipelines.job import Job
+from pipelines.stage import STAGES, NotReadyError, Part, item_state
+
+ALL_STAGES: tuple[str, ...] = tuple(STAGES)
+SLICE_STAGES: tuple[str, ...] = ("source", "index", "count", "select", "cut")
+
+_POLL_S = 2.0
+
+
+class Reporter(Protocol):
+    """What a person sees while stages run."""
+
+    def stage_started(self, stage: str, *, items: int, weight: float, current: int) -> None:
+        """``items`` are to be made, ``current`` were made before."""
+        ...
+
+    def item_finished(self, receipt: Receipt, *, weight: float) -> None:
+        """One item has its receipt."""
+        ...
+
+    def stage_finished(self, report: "StageReport") -> None:
+        """All items have theirs."""
+        ...
+
+    def waiting(self, message: str) -> None:
+        """Another part of the job has not come as far."""
+        ...
+
+
+@dataclass(slots=True, kw_only=True)
+class StageReport:
+    """What one stage did in this call."""
+
+    stage: str
+    current: int = 0
+    """Items that were up to date before."""
+    made: list[Receipt] = field(default_factory=list)
+    """Receipts of this call, in the order of items."""
+    failed: list[Receipt] = field(default_factory=list)
+    """Every item that failed, now or before."""
+    seconds: float = 0.0
+
+    def count(self, state: str) -> int:
+        """How many items got that state in this call."""
+        return sum(receipt.state == state for receipt in self.made)
+
+
+def run_stage(
+    job: Job, stage: str, engine: Engine, reporter: Reporter, *, part: Part | None = None, force: bool = False
+) -> StageReport:
+    """Run one stage of one part.
+
+    Args:
+        job: the job; it is refreshed afterwards.
+        stage: which.
+        engine: where items are worked on.
+        reporter: told of every step.
+        part: this host's share of the videos.
+        force: make even what is up to date.
+
+    Raises:
+        NotReadyError: the stage waits for another part.
+        StorageError: the disk is full; what was made so far is kept.
+    """
+    started = time.perf_counter()
+    known = job.receipts(stage)
+    items = [item for item in job.plan(stage) if part is None or not item.owner or part.owns(item.owner)]
+    todo = [item for item in items if force or item_state(item, known.get(item.name), job.root) != "current"]
+    names = {item.name: item for item in todo}
+    report = StageReport(stage=stage, current=len(items) - len(todo))
+    report.failed = [
+        known[item.name] for item in items if item.name not in names and known[item.name].state == "failed"
+    ]
+    reporter.stage_started(stage, items=len(todo), weight=sum(item.weight for item in todo), current=report.current)
+    for receipt in engine.run([Task(item=item, previous=known.get(item.name)) for item in todo]):
+        report.made.append(receipt)
+        reporter.item_finished(receipt, weight=names[receipt.item].weight)
+    order = {name: number for number, name in enumerate(names)}
+    report.made.sort(key=lambda receipt: order[receipt.item])
+    report.failed += [receipt for receipt in report.made if receipt.state == "failed"]
+    report.seconds = time.perf_counter() - started
+    job.refresh()
+    reporter.stage_finished(report)
+    if len(report.made) < len(todo):
+        full = next(receipt for receipt in report.failed if receipt.reason == StorageError.reason)
+        raise StorageError(f"{full.message} ({stage} stopped with {len(todo) - len(report.made)} items to go)")
+    return report
+
+
+def run_stages(
+    job: Job,
+    stages: Sequence[str],
+    engine: Engine,
+    reporter: Reporter,
+    *,
+    part: Part | None = None,
+    refreeze: bool = False,
+    patience_s: float = 0.0,
+) -> list[StageReport]:
+    """Run stages in order; at a barrier wait for the other parts as long as they make progress.
+
+    Args:
+        job: the job.
+        stages: names of ``STAGES``.
+        engine: where items are worked on.
+        reporter: told of every step.
+        part: this host's share.
+        refreeze: make the selection anew.
+        patience_s: how long to wait at a barrier without a sign of the other parts.
+
+    Raises:
+        NotReadyError: the other parts made no progress for ``patience_s``.
+        StorageError: the disk is full.
+    """
+    reports = []
+    for stage in stages:
+        _wait_for_parts(job, stage, reporter, patience_s if part is not None and part.count > 1 else 0.0)
+        reports.append(run_stage(job, stage, engine, reporter, part=part, force=refreeze and stage == "select"))
+    return reports
+
+
+def _wait_for_parts(job: Job, stage: str, reporter: Reporter, patience_s: float) -> None:
+    sign, since = _progress(job.root), time.monotonic()
+    while True:
+        try:
+            job.plan(stage)
+        except NotReadyError as error:
+            if time.monotonic() - since >= patience_s:
+                raise
+            reporter.waiting(str(error))
+            time.sleep(min(_POLL_S, patience_s))
+            job.refresh()
+            now = _progress(job.root)
+            if now != sign:
+                sign, since = now, time.monotonic()
+        else:
+            return
+
+
+def _progress(root: Path) -> tuple[tuple[str, int], ...]:
+    """Sizes of all receipt logs: they grow while any part lives."""
+    logs = sorted((root / "receipts").glob("*/*.jsonl"))
+    return tuple((str(log.relative_to(root)), log.stat().st_size) for log in logs)
