@@ -2,8 +2,8 @@
 
 The networks are nearly all the cost. With ``exact`` they see every frame; with the other efforts they see some, and
 between these the points of cars and people are carried by optical flow, and lanes, which have no points of their own to
-follow, by straight lines. Looks come closer together when objects grow fast, appear, vanish, or are not where flow said;
-a network that has seen nothing for a second looks twice per second.
+follow, by straight lines. Looks come closer together when objects grow fast, appear, vanish, or are not where flow put
+them; a network that has seen nothing for a second looks twice per second.
 """
 
 import math

@@ -33,9 +33,9 @@ def looks_of(extractors: Extractors) -> list[Look]:
     if extractors.detector:
         categories = tuple(c for c in _BOX_SCHEMA if c in extractors.heads or c not in bottom_up)
         looks.append(ObjectLook(extractors, categories))
-    taken = set(extractors.heads)
+    taken: set[Category] = set(extractors.heads)
     for model in extractors.fields:
-        wanted = {keypoint_schema(name).category for name in model.schema_names} - taken
+        wanted: set[Category] = {keypoint_schema(name).category for name in model.schema_names} - taken
         looks.append(FieldLook(model, frozenset(wanted)))
         taken |= wanted
     return looks

@@ -13,9 +13,7 @@ def box(x: float, y: float = 300, *, width: float = 40, height: float = 100) -> 
     return np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
 
 
-def follow(
-    paths: Sequence[Sequence[np.ndarray | None]], *, scores: list[float] | None = None, **changes: int
-) -> np.ndarray:
+def follow(paths: Sequence[Sequence[np.ndarray | None]], *, scores: list[float] | None = None) -> np.ndarray:
     """(frames, objects) ids for the paths of several objects; None where an object is not detected."""
     tracker = BoxTracker()
     table = np.full((len(paths[0]), len(paths)), UNTRACKED)
@@ -23,7 +21,7 @@ def follow(
         seen = [i for i, path in enumerate(paths) if path[frame] is not None]
         boxes = np.array([paths[i][frame] for i in seen]).reshape(-1, 4)
         marks = np.array([(scores or [0.9] * len(paths))[i] for i in seen])
-        table[frame, seen] = tracker.update(boxes, marks, **changes)
+        table[frame, seen] = tracker.update(boxes, marks)
     return table
 
 
