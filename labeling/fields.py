@@ -1,16 +1,22 @@
 """Bottom-up keypoints: composite intensity and association fields (CIF and CAF), grown into objects.
 
-OpenPifPaf: Kreiss, Bertoni, Alahi 2019 and 2021. Written from the papers; no code of it is used.
+PifPaf, Kreiss, Bertoni, Alahi 2019, and OpenPifPaf, the same 2021. Written from the papers: no code of it is used.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from labeling.labels import Keypoints
+from labeling import field_growth as growth
+from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
 from labeling.model_cards import CifcafCard, FieldHeadCard
-from labeling.onnx_model import DEFAULT_PROVIDERS, OnnxModel
+from labeling.onnx_model import DEFAULT_PROVIDERS, OnnxModel, check_frame, network_input
+from labeling.schemas import keypoint_schema
+
+_BEST_POINTS, _BEST_WEIGHT = 3, 3.0
+"""An object's score is the mean over all K points, the three best counted three times (PifPaf)."""
 
 
 class FieldDecoder:
@@ -23,9 +29,12 @@ class FieldDecoder:
 
     def __init__(self, head: FieldHeadCard, *, stride: int) -> None:
         self.head, self.stride = head, stride
+        table = keypoint_schema(head.schema_name)
+        self.edges = np.array(table.edges)
+        self.graph = _graph(self.edges, table.point_count)
 
     def decode(self, cif: np.ndarray, caf: np.ndarray) -> list[tuple[np.ndarray, float]]:
-        """The objects of one frame, best first.
+        """The objects of one frame, best first; the ``max_objects`` best where there are more.
 
         Args:
             cif: (K, 5, h, w) float32: -, confidence, x, y, scale per cell; x, y, scale in cells.
@@ -34,7 +43,31 @@ class FieldDecoder:
         Returns:
             Pairs of (K, 3) float32 points (x, y in input pixels, score; 0 = absent) and the object's score, 0 to 1.
         """
-        raise NotImplementedError
+        objects = self._grow(cif, caf)
+        objects = objects[np.argsort(-object_scores(objects[:, :, 3]), kind="stable")]
+        growth.suppress_points(objects)
+        objects[objects[:, :, 3] < self.head.point_threshold] = 0
+        scores = object_scores(objects[:, :, 3])
+        found = []
+        for n in np.argsort(-scores, kind="stable"):
+            enough = growth.largest_component(objects[n, :, 3] > 0, self.edges) >= self.head.min_points
+            if scores[n] >= self.head.instance_threshold and enough:
+                found.append((objects[n][:, [0, 1, 3]].astype(np.float32), float(scores[n])))
+        return found
+
+    def _grow(self, cif: np.ndarray, caf: np.ndarray) -> np.ndarray:
+        head, stride = self.head, float(self.stride)
+        height, width = cif.shape[2] * stride, cif.shape[3] * stride
+        cells = growth.gather_cells(cif, head.map_threshold, stride)
+        index = growth.index_map(cells, len(cif), width, height)
+        seed_scores = growth.score_seeds(index, cells)
+        seeds = np.flatnonzero(seed_scores >= head.seed_threshold)
+        seeds = seeds[np.argsort(-seed_scores[seeds], kind="stable")]
+        links = growth.gather_connections(caf, head.connection_threshold, stride, width)
+        return growth.grow_all(
+            seeds, seed_scores, cells, links, index, self.graph,
+            head.growth_threshold, head.relative_threshold, head.max_objects,
+        )  # fmt: skip
 
 
 class FieldModel:
@@ -55,6 +88,7 @@ class FieldModel:
     ) -> None:
         self.card = card
         self.model = OnnxModel(card, path, providers=providers, threads=threads, max_batch=max_batch)
+        self.decoders = tuple(FieldDecoder(head, stride=card.stride) for head in card.heads)
 
     @property
     def schema_names(self) -> tuple[str, ...]:
@@ -71,4 +105,88 @@ class FieldModel:
         Raises:
             ModelError: a frame that is no RGB picture, or a network's output that is not finite.
         """
-        raise NotImplementedError
+        found: list[list[Keypoints]] = []
+        for start in range(0, len(frames), self.model.max_batch):
+            pictures = [padded_input(frame, self.card) for frame in frames[start : start + self.model.max_batch]]
+            outputs = self.model.run(np.stack([picture for picture, _ in pictures]))
+            for i, (_, ratio) in enumerate(pictures):
+                fields = [output[i] for output in outputs]
+                found.append(self._objects(fields, ratio=ratio, frame=first_frame + start + i))
+        return found
+
+    def _objects(self, fields: Sequence[np.ndarray], *, ratio: float, frame: int) -> list[Keypoints]:
+        objects = []
+        for n, decoder in enumerate(self.decoders):
+            for points, score in decoder.decode(fields[2 * n], fields[2 * n + 1]):
+                # Pixel centres lie on integers in both pictures.
+                present = points[:, 2] > 0
+                points[present, :2] = (points[present, :2] + 0.5) / ratio - 0.5
+                objects.append(_keypoints(points, score, schema_name=decoder.head.schema_name, frame=frame))
+        return objects
+
+
+def padded_input(frame: np.ndarray, card: CifcafCard) -> tuple[np.ndarray, float]:
+    """The network's input for one frame, and its scale relative to the frame.
+
+    The frame is scaled to fit into the input less its one extra row and column, put at the top left, and padded with
+    the mean colour, right and bottom.
+
+    Returns:
+        (3, input_height, input_width) float32, and the scale.
+
+    Raises:
+        ModelError: the frame is not (H, W, 3) uint8, or empty.
+    """
+    check_frame(frame)
+    ratio = min((card.input_width - 1) / frame.shape[1], (card.input_height - 1) / frame.shape[0])
+    if ratio != 1:
+        size = (max(1, round(frame.shape[1] * ratio)), max(1, round(frame.shape[0] * ratio)))
+        frame = cv2.resize(frame, size, interpolation=cv2.INTER_AREA if ratio < 1 else cv2.INTER_LINEAR)
+    planes = np.zeros((3, card.input_height, card.input_width), np.float32)
+    planes[:, : frame.shape[0], : frame.shape[1]] = network_input(frame, card)
+    return planes, ratio
+
+
+def complete_lane(points: np.ndarray) -> np.ndarray:
+    """A lane's present points, joined and resampled to K evenly spaced ones, nearest first.
+
+    Args:
+        points: (K, 3) float32: x, y, score; at least two present.
+
+    Returns:
+        (K, 3) float32: evenly spaced along the line from the first present point to the last, each scored by the lesser
+        of its neighbours; all zero where fewer than two points are present.
+    """
+    line = points[points[:, 2] > 0]
+    if len(line) < 2:
+        return np.zeros_like(points)
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+    places = np.linspace(0, along[-1], len(points))
+    after = np.clip(np.searchsorted(along, places), 1, len(line) - 1)
+    scores = np.minimum(line[after - 1, 2], line[after, 2])
+    columns = [np.interp(places, along, line[:, axis]) for axis in range(2)]
+    return np.stack([*columns, scores], axis=1).astype(points.dtype)
+
+
+def object_scores(point_scores: np.ndarray) -> np.ndarray:
+    """(M,) scores of objects from (M, K) scores of their points: a mean, the three best counted three times."""
+    weights = np.ones(point_scores.shape[1])
+    weights[:_BEST_POINTS] = _BEST_WEIGHT
+    return np.sort(point_scores, axis=1)[:, ::-1] @ (weights / weights.sum())
+
+
+def _graph(edges: np.ndarray, kinds: int) -> growth.Graph:
+    source, target = edges.ravel(), edges[:, ::-1].ravel()
+    leaving = np.argsort(source, kind="stable")
+    starts = np.searchsorted(source[leaving], np.arange(kinds + 1))
+    return growth.Graph(source, target, starts, leaving)
+
+
+def _keypoints(points: np.ndarray, score: float, *, schema_name: str, frame: int) -> Keypoints:
+    present = points[:, 2] > 0
+    corners = [points[present, :2].min(axis=0), points[present, :2].max(axis=0)]
+    return Keypoints(
+        frame=frame, category=keypoint_schema(schema_name).category, schema=schema_name, score=min(score, 1.0),
+        box_xyxy=np.concatenate(corners).astype(np.float32), points=points,
+        point_source=np.where(present, POINT_DETECTED, POINT_ABSENT).astype(np.int8),
+    )  # fmt: skip

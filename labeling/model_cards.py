@@ -157,16 +157,23 @@ class FieldHeadCard(BaseModel, frozen=True, extra="forbid", populate_by_name=Tru
     caf: str = "caf"
     """Names of the outputs; where the graph calls them otherwise, they are told by their shapes."""
     seed_threshold: float = 0.2
+    """Objects start at cells whose 0.9 map + 0.1 confidence reaches it."""
     connection_threshold: float = 0.3
+    """Least confidence of a CAF cell."""
     map_threshold: float = 0.3
-    """Cells of the CIF below it add nothing to the accumulated map."""
+    """CIF cells of less confidence neither add to the accumulated map nor start an object."""
     growth_threshold: float = 0.15
+    """Least score of a point that an object grows by."""
     relative_threshold: float = 0.5
-    """A second-best connection is blended in when it scores this much of the best."""
+    """Least score of such a point as a share of the score of the point that it grows from."""
     point_threshold: float = 0.15
-    """Points that score less are absent."""
+    """Points that score less in the end are absent."""
     instance_threshold: float = 0.15
+    """Least score of an object."""
     min_points: int = 1
+    """Least number of its points that edges connect."""
+    max_objects: int = Field(default=200, gt=0)
+    """Growing stops there, so that a frame of noise ends in bounded time."""
 
     @field_validator("schema_name")
     @classmethod
