@@ -250,7 +250,7 @@ class EgoTable:
     """(T,) float32: one sigma of the scale, relative to it."""
     intrinsics: Intrinsics
     """Of the working picture."""
-    camera: dict[str, float | None]
+    road: dict[str, float | None]
     """Height over the road and pitch against it, with the pitch's sigma (null where no road was seen)."""
 
 
@@ -266,9 +266,8 @@ def write_ego(path: Path, motion: "EgoMotion", *, first_frame: int) -> None:
         pa.array([str(source) for source in motion.scale_source], _TEXT),
         pa.array(np.asarray(motion.scale_sigma, dtype=np.float32), _F32),
     ]
-    camera = {name: getattr(motion, name) for name in ("camera_height_m", "pitch_rad", "pitch_sigma_rad")}
-    finite = {name: float(value) if np.isfinite(value) else None for name, value in camera.items()}
-    metadata = {"intrinsics": asdict(motion.intrinsics), "camera": finite}
+    road = {name: float(value) if np.isfinite(value) else None for name, value in asdict(motion.road).items()}
+    metadata = {"intrinsics": asdict(motion.intrinsics), "road": road}
     write_table(path, pa.Table.from_arrays(columns, schema=EGO_SCHEMA), metadata=metadata)
 
 
@@ -284,7 +283,7 @@ def read_ego(path: Path) -> EgoTable:
         scale_source=table["scale_source"].to_pylist(),
         scale_sigma=_column(table, "scale_sigma"),
         intrinsics=Intrinsics(**metadata["intrinsics"]),
-        camera=metadata["camera"],
+        road=metadata["road"],
     )
 
 

@@ -240,7 +240,7 @@ def _times(frames: RunFrames, run: Span, clip: Span) -> dict[str, Any]:
 def _ego_record(ego: EgoTable, run: Span, clip: Span) -> dict[str, Any]:
     rows = slice(clip.start - run.start, clip.end - run.start)
     return {
-        **ego.camera,
+        "road": ego.road,
         "modes": dict(sorted(Counter(ego.mode[rows]).items())),
         "scale_sources": dict(sorted(Counter(ego.scale_source[rows]).items())),
         "confidence": round(float(np.mean(ego.confidence[rows])), 6),
