@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from labeling.labels import POINT_ABSENT, POINT_CARRIED, POINT_INTERPOLATED, Keypoints
+from labeling.schemas import Category
 
 _WINDOW = (13, 13)
 _LEVELS = 3
@@ -19,6 +20,8 @@ _MIN_FOLLOWED_SHARE = 0.4
 """An object of which less is followed is lost."""
 _MIN_CORNERS = 4
 """Points on an even surface follow nothing: an object needs this many that return."""
+_SLACK: dict[Category, float] = {"car": 0.01, "person": 0.04, "lane": 0.01}
+"""Share of the box diagonal by which a point's own flow may differ from the object's in one frame: limbs swing."""
 _MAX_CLOSING = 0.15
 """Share of the box diagonal by which a carried point may miss its next detection before the flow is not believed."""
 
@@ -145,7 +148,7 @@ def _moved(label: Keypoints, start: np.ndarray, end: np.ndarray, good: np.ndarra
     scale, shift = _scale_and_shift(start[good], end[good]) if good.sum() >= 2 else (1.0, np.zeros(2))
     modelled = start * scale + shift
     # A point that slipped along an edge returns to its start and is wrong all the same: the object's motion bounds it.
-    slack = 0.02 * box_diagonal(label.box_xyxy) + 1.5
+    slack = _SLACK[label.category] * box_diagonal(label.box_xyxy) + 0.25
     trusted = good & (np.linalg.norm(end - modelled, axis=1) <= slack)
     new = np.where(trusted[:, None], end, modelled).astype(np.float32)
     points, source = label.points.copy(), label.point_source.copy()

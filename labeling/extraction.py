@@ -133,6 +133,7 @@ class _Channel:
         self._key_frame: int | None = None
         self._paths: dict[int, list[Keypoints]] = {}
         self._previous: Callable[[], np.ndarray] | None = None
+        self._latest: tuple[np.ndarray, int] | None = None
         self._gap = 1
         self._last_seen: int | None = None
 
@@ -144,13 +145,12 @@ class _Channel:
         healthy = self._carry(grey, number)
         if self._key_frame is None or number - self._key_frame >= self._gap or not healthy:
             self._look(frame, number)
-        self._previous = grey
+        self._previous, self._latest = grey, (frame, number)
 
     def finish(self) -> None:
-        """The run, or what came before a cut, ends: what was carried so far is all that will be known."""
-        for path in self._paths.values():
-            self.labels += path[1:]
-        self._paths = {}
+        """The run, or what came before a cut, ends: its last frame is looked at, so that nothing carried stays open."""
+        if self._latest and self._latest[1] != self._key_frame:
+            self._look(*self._latest)
 
     def _carry(self, grey: Callable[[], np.ndarray], number: int) -> bool:
         """Carry the last look's objects into this frame; False when one of them was lost on the way."""
@@ -203,11 +203,11 @@ class _Channel:
             if label.category == "person":
                 gap = min(gap, self.settings.max_person_gap)
             if label.track_id in before:
-                gap = min(gap, _straight_gap(before[label.track_id], label, max_bend=self.settings.max_bend))
+                gap = min(gap, straight_gap(before[label.track_id], label, max_bend=self.settings.max_bend))
         return max(1, int(gap))
 
 
-def _straight_gap(before: Keypoints, after: Keypoints, *, max_bend: float) -> float:
+def straight_gap(before: Keypoints, after: Keypoints, *, max_bend: float) -> float:
     """How many frames an object may be taken to grow evenly: size is 1 / distance, which bends by (rate gap)^2 / 4."""
     frames = after.frame - before.frame
     rate = abs(math.log(box_diagonal(after.box_xyxy) / box_diagonal(before.box_xyxy))) / max(1, frames)

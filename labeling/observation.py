@@ -33,10 +33,10 @@ def looks_of(extractors: Extractors) -> list[Look]:
     if extractors.detector:
         categories = tuple(c for c in _BOX_SCHEMA if c in extractors.heads or c not in bottom_up)
         looks.append(ObjectLook(extractors, categories))
-    taken: set[Category] = set(extractors.heads)
+    taken = frozenset[Category](extractors.heads)
     for model in extractors.fields:
-        wanted: set[Category] = {keypoint_schema(name).category for name in model.schema_names} - taken
-        looks.append(FieldLook(model, frozenset(wanted)))
+        wanted = frozenset[Category](keypoint_schema(name).category for name in model.schema_names) - taken
+        looks.append(FieldLook(model, wanted))
         taken |= wanted
     return looks
 

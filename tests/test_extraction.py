@@ -1,0 +1,180 @@
+"""How often the networks look, and what is carried in between: on moving textures whose points are known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from labeling.carrying import carry, close_gap, interpolate_gap, small_grey
+from labeling.errors import ConfigError, ModelError
+from labeling.extraction import EFFORTS, Effort, label_with, straight_gap
+from labeling.extractors import choose_extractors
+from labeling.labels import POINT_CARRIED, POINT_DETECTED, POINT_INTERPOLATED, Keypoints
+
+WIDTH, HEIGHT = 320, 224
+
+
+def texture(seed: int, width: int, height: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 2.0)
+
+
+class MovingCard:
+    """A textured card that slides and grows over a textured wall; it knows where its 24 points are in every frame."""
+
+    carries = True
+
+    def __init__(
+        self, *, speed: float = 2.0, growth: float = 0.0, cut: int | None = None, shown: range = range(999)
+    ) -> None:
+        self.speed, self.growth, self.cut, self.shown = speed, growth, cut, shown
+        self.card, self.wall = texture(1, 96, 72), texture(2, WIDTH, HEIGHT)
+        grid = np.stack(np.meshgrid(np.linspace(8, 88, 6), np.linspace(8, 64, 4)), axis=-1).reshape(-1, 2)
+        self.grid = grid.astype(np.float64)
+        self.seen: list[int] = []
+
+    def place(self, frame: int) -> tuple[float, np.ndarray]:
+        return np.exp(self.growth * frame), np.array([40 + self.speed * frame, 70.0])
+
+    def truth(self, frame: int) -> np.ndarray:
+        scale, shift = self.place(frame)
+        return self.grid * scale + shift
+
+    def render(self, frame: int) -> np.ndarray:
+        picture = self.wall.copy() if self.cut is None or frame < self.cut else texture(9, WIDTH, HEIGHT)
+        if frame in self.shown and (self.cut is None or frame < self.cut):
+            scale, shift = self.place(frame)
+            matrix = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
+            mask = cv2.warpAffine(np.ones(self.card.shape[:2], np.uint8), matrix, (WIDTH, HEIGHT))
+            card = cv2.warpAffine(self.card, matrix, (WIDTH, HEIGHT))
+            picture[mask > 0] = card[mask > 0]
+        return picture
+
+    def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
+        self.seen.append(number)
+        if number not in self.shown or (self.cut is not None and number >= self.cut):
+            return []
+        return [self.label(number)]
+
+    def label(self, number: int) -> Keypoints:
+        points = np.concatenate([self.truth(number), np.ones((24, 1))], axis=1).astype(np.float32)
+        box = np.concatenate([points[:, :2].min(axis=0), points[:, :2].max(axis=0)])
+        return Keypoints(
+            frame=number, category="car", schema="car24", score=0.9, box_xyxy=box, points=points,
+            point_source=np.full(24, POINT_DETECTED, np.int8),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(("effort", "least_saving"), [("exact", 1), ("balanced", 4), ("fast", 6)])
+def test_efforts_look_less_and_stay_near(effort: Effort, least_saving: int) -> None:
+    scene = MovingCard(speed=1.7, growth=0.002)
+    labels = label_with([scene], (scene.render(t) for t in range(73)), first_frame=0, effort=EFFORTS[effort])
+    assert [label.frame for label in labels] == list(range(73))
+    assert len(scene.seen) <= 73 / least_saving + 3
+    errors = [np.linalg.norm(label.points[:, :2] - scene.truth(label.frame), axis=1).max() for label in labels]
+    assert max(errors) < 2.0 and np.median(errors) < 1.0
+    assert {label.track_id for label in labels} == {0}
+
+
+def test_sources_say_what_was_seen_and_what_carried() -> None:
+    scene = MovingCard()
+    labels = label_with([scene], (scene.render(t) for t in range(40)), first_frame=0, effort="balanced")
+    for label in labels:
+        expected = POINT_DETECTED if label.frame in scene.seen else POINT_CARRIED
+        assert (label.point_source == expected).mean() > 0.9, label.frame
+
+
+def test_the_last_frame_is_looked_at() -> None:
+    scene = MovingCard()
+    label_with([scene], (scene.render(t) for t in range(38)), first_frame=0, effort="fast")
+    assert scene.seen[-1] == 37
+
+
+def test_nothing_is_carried_over_a_cut() -> None:
+    scene = MovingCard(cut=30)
+    frames = (scene.render(t) for t in range(60))
+    labels = label_with([scene], frames, first_frame=0, effort="balanced", breaks=frozenset({30}))
+    assert max(label.frame for label in labels) == 29
+    assert 30 in scene.seen
+
+
+def test_an_object_that_vanishes_is_not_shown_for_long() -> None:
+    scene = MovingCard(speed=0.5, shown=range(30))
+    labels = label_with([scene], (scene.render(t) for t in range(60)), first_frame=0, effort="fast")
+    assert max(label.frame for label in labels) <= 29 + 6
+
+
+def test_an_empty_road_is_looked_at_twice_a_second() -> None:
+    scene = MovingCard(shown=range(0))
+    label_with([scene], (scene.render(t) for t in range(240)), first_frame=0, effort="balanced")
+    late = [frame for frame in scene.seen if frame >= 48]
+    assert len(late) <= (240 - 48) / 12 + 1
+
+
+def test_what_passes_in_a_blink_is_no_object() -> None:
+    scene = MovingCard(shown=range(10, 13))
+    assert label_with([scene], (scene.render(t) for t in range(40)), first_frame=0, effort="exact") == []
+
+
+def test_fast_growth_brings_looks_closer() -> None:
+    """A size that goes as 1 / t departs from its chord by no more than the bound, and nearly by that."""
+    scene = MovingCard(growth=0.05)
+    gap = straight_gap(scene.label(0), scene.label(4), max_bend=0.03)
+    rate = 0.05
+    size = 1 / (1 - rate * np.array([-gap / 2, 0.0, gap / 2]))
+    bend = (size[0] + size[2]) / 2 - size[1]
+    assert bend == pytest.approx(0.03, rel=0.15)
+
+
+def test_flow_says_when_it_lost_an_object() -> None:
+    scene = MovingCard()
+    grey, other = small_grey(scene.render(0)), small_grey(texture(7, WIDTH, HEIGHT))
+    (kept,) = carry(grey, small_grey(scene.render(1)), [scene.label(0)], frame=1)
+    (lost,) = carry(grey, other, [scene.label(0)], frame=1)
+    assert kept.followed and not lost.followed
+    assert np.abs(kept.label.points[:, :2] - scene.truth(1)).max() < 1.0
+
+
+def moved(label: Keypoints, frame: int, shift: float) -> Keypoints:
+    points = label.points.copy()
+    points[:, 0] += shift
+    return replace(
+        label, frame=frame, points=points, box_xyxy=label.box_xyxy + np.array([shift, 0, shift, 0], np.float32)
+    )
+
+
+def test_the_miss_is_spread_over_the_way() -> None:
+    start = MovingCard(speed=0).label(0)
+    path = [start, *(moved(start, t, 2.0 * t) for t in range(1, 5))]  # drifts by 2 px a frame
+    between = close_gap(path, moved(start, 4, 4.0))  # it really moved by 1 px a frame
+    assert [round(float(label.points[0, 0] - start.points[0, 0]), 3) for label in between] == [1.0, 2.0, 3.0]
+
+
+def test_a_far_miss_is_interpolated_instead() -> None:
+    start = MovingCard(speed=0).label(0)
+    path = [start, moved(start, 1, 50.0), moved(start, 2, 100.0)]
+    (between,) = close_gap(path, moved(start, 2, 10.0))
+    assert (between.point_source == POINT_INTERPOLATED).all()
+    assert between.points[:, 0] == pytest.approx(start.points[:, 0] + 5)
+
+
+def test_points_that_one_end_lacks_are_not_made_up() -> None:
+    start = MovingCard(speed=0).label(0)
+    end = moved(start, 4, 8.0)
+    end.points[3] = 0
+    assert all(label.points[3, 2] == 0 for label in interpolate_gap(start, end))
+
+
+def test_unknown_extractors_are_named() -> None:
+    with pytest.raises(ConfigError, match="yolox_nano"):
+        choose_extractors(["yolo_nano"])
+
+
+def test_absent_weights_say_how_to_get_them(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="yolox_l"):
+        choose_extractors(["yolox_l"], models_dir=tmp_path)
+    choice = choose_extractors(None, models_dir=tmp_path)
+    assert choice.cards == () and "yolox_l" in choice.absent
+    assert choice.missing_categories == ("car", "person", "lane")
