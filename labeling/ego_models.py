@@ -1,46 +1,13 @@
-"""The geometry half of ego-motion: robust two-view models over corner tracks, and which of them a pair of frames needs.
-
-The ladder is: *still* (no parameter), *turning* (a rotation, 3), *moving* (a rotation and a direction, 5). Each rung
-is fitted by iteratively re-weighted least squares from the last motion; the lowest rung that explains the tracks wins
-by GRIC (Torr, "Bayesian model estimation and selection for epipolar geometry", IJCV 2002).
+"""Two-view models over corner tracks: a turn (3 parameters), a turn and a direction (5), each by robust least squares.
 
 A pair's rotation R and translation t take coordinates in the first camera to the second: ``x2 = R x1 + t``.
 Corners are given as normalised coordinates ``(u, v) = ((x - cx) / fx, (y - cy) / fy)``, noise in the same unit.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Literal
 
-import cv2
 import numpy as np
 from numba import njit
-
-MotionMode = Literal["still", "turning", "moving"]
-
-GRIC_OUTLIER = 2.0
-"""Torr's lambda 3: a residual costs at most this times the residual's dimension."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PairMotion:
-    """How the camera moved between two frames."""
-
-    mode: MotionMode
-    rotation: np.ndarray
-    """(3, 3) first camera to second."""
-    direction: np.ndarray
-    """(3,) unit translation of ``x2 = R x1 + t``; zero unless moving."""
-    information: np.ndarray
-    """(5, 5) inverse covariance of (rotation vector, two tangent coordinates of the direction along
-    ``tangent_basis``)."""
-    inlier: np.ndarray
-    """(n,) bool over the pair's corners."""
-    inlier_share: float
-    costs: tuple[float, float, float]
-    """GRIC of still, turning, moving; per corner."""
-    sign_margin: float
-    """How clearly parallax says forward rather than backward along ``direction``: log likelihood ratio, >= 0."""
 
 
 @njit(cache=True)
@@ -258,40 +225,3 @@ def parallaxes(first: np.ndarray, second: np.ndarray, rotation: np.ndarray, dire
         out[i, 0] = ((second[i, 0] - x) * gain0 + (second[i, 1] - y) * gain1) / gain
         out[i, 1] = gain
     return out
-
-
-def sign_evidence(parallax: np.ndarray, noise: float) -> float:
-    """Log likelihood ratio that the direction points the right way rather than backwards, each corner's say bounded.
-
-    A corner behind the camera must be noise about zero depth^-1; ``cv2.recoverPose`` instead counts corners nearer
-    than fifty baselines and so knows nothing at walking speed.
-    """
-    square = np.minimum((parallax / noise) ** 2, 2.0 * GRIC_OUTLIER**2) / 2.0
-    return float(square[parallax > 0].sum() - square[parallax < 0].sum())
-
-
-def gric(square: np.ndarray, *, dimension: int, parameters: int) -> float:
-    """Torr's GRIC per corner, of squared residuals in units of the noise.
-
-    Args:
-        square: (n,) squared residual over noise squared.
-        dimension: of the manifold the corner pairs lie on (2 for a point map, 3 for epipolar geometry).
-        parameters: of the model.
-    """
-    count = max(len(square), 1)
-    robust = np.minimum(square, GRIC_OUTLIER * (4 - dimension)).sum()
-    return float(robust + dimension * math.log(4) * count + parameters * math.log(4 * count)) / count
-
-
-def five_point(first: np.ndarray, second: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Rotation and direction (sign open) from five-point RANSAC, or None; for when the last motion is no start."""
-    if len(first) < 8:
-        return None
-    essential, _ = cv2.findEssentialMat(
-        first, second, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=2.0 * noise, maxIters=500
-    )
-    if essential is None or essential.shape != (3, 3) or not np.isfinite(essential).all():
-        return None
-    one, two, direction = cv2.decomposeEssentialMat(essential)
-    rotation = one if np.trace(one) > np.trace(two) else two
-    return rotation, direction[:, 0]

@@ -1,46 +1,47 @@
 """Ego-motion: a camera trajectory from a run's frames, with no more of a model than the frames need.
 
-``estimate_ego_motion`` tracks corners (``ego_tracks``), explains each pair of frames by the lowest sufficient rung of
-a ladder of models (``ego_models``), takes metric scale from the road (``ego_scale``) and chains the steps.
-``solve_run`` does the last three on stored tracks, so that a better focal length costs no second look at the pictures.
+``estimate_ego_motion`` tracks corners (``ego_tracks``), explains each step by the lowest sufficient rung of a ladder of
+models (``ego_ladder``, ``ego_steps``, ``ego_modes``), takes metric scale from the road (``ego_scale``, ``ego_speed``),
+smooths and chains the steps. ``solve_run`` does all but the first on stored tracks, so that a better focal length
+(``ego_calibration``) costs no second look at the pictures.
 """
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
-from labeling.camera import Intrinsics, Trajectory, rigid
-from labeling.ego_models import (
-    PairMotion,
-    fit_moving,
-    fit_turning,
-    five_point,
-    gric,
-    parallaxes,
-    sampson_residuals,
-    sign_evidence,
-    turning_residuals,
+from labeling.camera import Intrinsics, Trajectory, rebased_trajectory
+from labeling.ego_chain import (
+    chained,
+    interpolated,
+    length_evidence,
+    moves,
+    output_times,
+    smoothed_steps,
+    turns_and_directions,
 )
-from labeling.ego_scale import NO_ROAD, RoadSamples, pooled_pitch, road_samples, step_in_heights
-from labeling.ego_tracks import RunTracks, TrackSettings, matched, track_run
+from labeling.ego_modes import MODES, MOVING, cheapest_path, travel_signs
+from labeling.ego_scale import Depths, corner_depths, pooled_pitch, road_part
+from labeling.ego_settings import EgoSettings
+from labeling.ego_speed import Speeds, run_speeds
+from labeling.ego_steps import Step, StepSolver
+from labeling.ego_tracks import RunTracks, track_run
+from labeling.errors import DataError
+
+__all__ = ["EgoMotion", "EgoSettings", "RoadView", "estimate_ego_motion", "solve_run"]
 
 
-class EgoSettings(BaseModel):
-    """How ego-motion is estimated."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoadView:
+    """How the camera looks at the road."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    tracks: TrackSettings = TrackSettings()
-    noise_px: float = Field(default=0.2, gt=0)
-    """Least standard deviation of a tracked corner, pixels of the working picture."""
-    least_corners: int = Field(default=20, ge=8)
-    """With fewer the last motion is held."""
-    least_inlier_share: float = Field(default=0.6, gt=0, lt=1)
-    """Below it five-point RANSAC proposes another start."""
-    default_speed_m_s: float = Field(default=8.0, ge=0)
-    """Speed while moving where no road has been seen anywhere in the run."""
+    height_m: float
+    """Over the road; metric scale is proportional to it."""
+    pitch_rad: float
+    """Positive looks down."""
+    pitch_sigma_rad: float
+    """Infinite where no road was seen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,7 +51,7 @@ class EgoMotion:
     trajectory: Trajectory
     """In the run's first camera, metres."""
     mode: np.ndarray
-    """(T,) str: still | turning | moving | held | cut: how frame i was reached from frame i - 1; frame 0 repeats frame
+    """(T,) str: still | turning | moving | held | cut: how frame i was reached from i - 1; frame 0 repeats frame
     1's."""
     confidence: np.ndarray
     """(T,) float32, 0 to 1."""
@@ -60,11 +61,8 @@ class EgoMotion:
     """(T,) float32: one sigma of the metric scale, relative."""
     intrinsics: Intrinsics
     """The camera that was assumed, in pixels of the run's picture."""
-    camera_height_m: float
-    pitch_rad: float
-    """Pitch against the road, pooled over the run; positive looks down."""
-    pitch_sigma_rad: float
-    """Infinite where no road was seen."""
+    road: RoadView
+    """How the camera was found to look at the road."""
 
 
 def estimate_ego_motion(
@@ -89,7 +87,7 @@ def estimate_ego_motion(
         breaks: frames, counted from the run's first, before which a cut or a hole lies.
 
     Raises:
-        DataError: frames, times and boxes that do not agree.
+        DataError: frames, times and boxes that do not agree, or intrinsics of another picture.
     """
     settings = settings or EgoSettings()
     tracks = track_run(frames, times_s, boxes=boxes, breaks=breaks, settings=settings.tracks)
@@ -97,151 +95,136 @@ def estimate_ego_motion(
 
 
 def solve_run(
-    tracks: RunTracks, *, intrinsics: Intrinsics, camera_height_m: float = 1.5, settings: EgoSettings | None = None
+    tracks: RunTracks,
+    *,
+    intrinsics: Intrinsics,
+    camera_height_m: float = 1.5,
+    pitch_rad: float | None = None,
+    settings: EgoSettings | None = None,
 ) -> EgoMotion:
-    """The geometry of ``estimate_ego_motion`` on stored tracks."""
+    """The geometry of ``estimate_ego_motion`` on stored tracks.
+
+    Args:
+        tracks: of ``track_run``.
+        intrinsics: of the run's pictures.
+        camera_height_m: over the road.
+        pitch_rad: the camera's pitch against the road where the whole video has told it; otherwise this run's own.
+        settings: how to estimate.
+
+    Raises:
+        DataError: intrinsics of another picture.
+    """
     settings = settings or EgoSettings()
-    camera = intrinsics.resized(tracks.width, tracks.height)
-    solver = _PairSolver(camera, settings)
-    count = len(tracks.frames)
-    steps = np.tile(np.eye(4), (count, 1, 1))
-    mode, confidence = np.full(count, "held", "<U8"), np.zeros(count, np.float32)
-    roads: list[RoadSamples] = [NO_ROAD] * count
-    directions = np.zeros((count, 3))
-    for index in range(1, count):
-        frame = tracks.frames[index]
-        if frame.cut:
-            mode[index] = "cut"
-            solver.forget()
-            continue
-        motion, roads[index] = solver.step(tracks, index)
-        mode[index] = motion.mode if motion is not None else "held"
-        steps[index, :3, :3] = solver.rotation
-        directions[index] = solver.direction
-        confidence[index] = 0.0 if motion is None else motion.inlier_share
-    pitch, pitch_sigma = pooled_pitch([road for road in roads if len(road.row)])
-    lengths, sigma, source = _lengths(roads, mode, tracks.times_s, pitch, camera_height_m, settings)
-    steps[:, :3, 3] = directions * lengths[:, None]
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    for index in range(1, count):
-        # A step takes the first camera's coordinates to the second's; cam_to_world runs the other way.
-        rotation = steps[index, :3, :3].T
-        poses[index] = poses[index - 1] @ rigid(rotation, -rotation @ steps[index, :3, 3])
-    if count > 1:
-        mode[0], confidence[0], source[0], sigma[0] = mode[1], confidence[1], source[1], sigma[1]
-    return EgoMotion(
-        trajectory=Trajectory(timestamps_s=_output_times(tracks.times_s), cam_to_world=poses),
-        mode=mode, confidence=confidence, scale_source=source, scale_sigma=sigma.astype(np.float32),
-        intrinsics=intrinsics, camera_height_m=camera_height_m, pitch_rad=pitch, pitch_sigma_rad=pitch_sigma,
+    if (intrinsics.width, intrinsics.height) != (tracks.source_width, tracks.source_height):
+        raise DataError(
+            f"intrinsics are for {intrinsics.width}x{intrinsics.height}, the run's pictures are "
+            f"{tracks.source_width}x{tracks.source_height}; map them with Intrinsics.mapped first"
+        )
+    solver = StepSolver(tracks, intrinsics.resized(tracks.width, tracks.height), settings)
+    steps, cuts = solver.solve()
+    kept, times = solver.shown
+    states = _states(steps, settings)
+    signs = _signs(steps, settings)
+    depths = [
+        corner_depths(step.corners, step.pair, sign=sign) if step else None
+        for step, sign in zip(steps, signs, strict=True)
+    ]
+    roads = [_road_of(step, sign) for step, sign in zip(steps, signs, strict=True)]
+    road = _road_view(roads, states, camera_height_m, pitch_rad)
+    rotations, directions = turns_and_directions(steps, states, signs, cuts)
+    rotations, directions = smoothed_steps(steps, states, cuts, rotations, directions, settings)
+    moving = moves(steps, states, cuts)
+    evidence = length_evidence(steps, depths, roads, directions, times, moving, road.pitch_rad)
+    speeds = run_speeds(
+        evidence, moving, height_m=camera_height_m, scale_walk=settings.scale_walk,
+        default_depth_heights=settings.default_depth_heights,
     )  # fmt: skip
+    lengths = speeds.metres_per_s * np.diff(times, prepend=times[0])
+    poses = chained(rotations, directions * lengths[:, None])
+    mode = np.array(
+        [_mode_name(step, state, cut) for step, state, cut in zip(steps, states, cuts, strict=True)], dtype="<U8"
+    )
+    confidence = np.array([_confidence(step, state) for step, state in zip(steps, states, strict=True)], np.float32)
+    return _on_all_frames(tracks, kept, times, poses, mode, confidence, speeds, intrinsics, road)
 
 
-class _PairSolver:
-    """Explains one pair of frames after another, starting each from the last motion."""
-
-    def __init__(self, camera: Intrinsics, settings: EgoSettings) -> None:
-        self._settings = settings
-        self._focal, self._centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-        self._noise = settings.noise_px / camera.fx
-        self._scales = self._noise * np.maximum(3.0, 15.0 * 0.7 ** np.arange(10))
-        self.forget()
-
-    def forget(self) -> None:
-        """Start afresh: no turn, forward."""
-        self.rotation = np.eye(3)
-        self._forward = np.array([0.0, 0.0, -1.0])
-        self.direction = np.zeros(3)
-
-    def step(self, tracks: RunTracks, index: int) -> tuple[PairMotion | None, RoadSamples]:
-        """The motion from frame ``index - 1`` to ``index``; None where too little is seen and the last motion is
-        held."""
-        before, after = tracks.frames[index - 1], tracks.frames[index]
-        at_first, at_second = matched(before, after)
-        if len(at_first) < self._settings.least_corners:
-            return None, NO_ROAD
-        first = (before.points_px[at_first] - self._centre) / self._focal
-        second = (after.points_px[at_second] - self._centre) / self._focal
-        motion = self._ladder(first, second)
-        self.rotation, self.direction = motion.rotation, motion.direction
-        if motion.mode != "moving":
-            return motion, NO_ROAD
-        self._forward = motion.direction
-        inlier = motion.inlier
-        road = road_samples(first[inlier], second[inlier], motion.rotation, motion.direction, noise=self._noise)
-        return motion, road
-
-    def _ladder(self, first: np.ndarray, second: np.ndarray) -> PairMotion:
-        weight = np.ones(len(first))
-        still = ((second - first) ** 2).sum(axis=1) / self._noise**2
-        turn = fit_turning(first, second, weight, self.rotation, self._scales)
-        turning = (turning_residuals(first, second, turn) ** 2).sum(axis=1) / self._noise**2
-        rotation, direction, information = self._moving(first, second, weight)
-        moving = sampson_residuals(first, second, rotation, direction) ** 2 / self._noise**2
-        costs = (
-            gric(still, dimension=2, parameters=0),
-            gric(turning, dimension=2, parameters=3),
-            gric(moving, dimension=3, parameters=5),
-        )
-        best = int(np.argmin(costs))
-        share = float((np.array([still, turning, moving])[best] < 9.0).mean())
-        along = parallaxes(first, second, rotation, direction)[:, 0]
-        evidence = sign_evidence(along[moving < 9.0], self._noise)
-        if evidence < 0:
-            direction = -direction
-        return PairMotion(
-            mode=("still", "turning", "moving")[best],
-            rotation=(np.eye(3), turn, rotation)[best],
-            direction=direction if best == 2 else np.zeros(3),
-            information=information,
-            inlier=(still, turning, moving)[best] < 9.0,
-            inlier_share=share, costs=costs, sign_margin=abs(evidence),
-        )  # fmt: skip
-
-    def _moving(self, first: np.ndarray, second: np.ndarray, weight: np.ndarray):
-        nothing = np.zeros(3)
-        fitted = fit_moving(
-            first, second, weight, self.rotation, self._forward, self._scales, self._noise, nothing, 0.0
-        )
-        share = np.mean(np.abs(sampson_residuals(first, second, fitted[0], fitted[1])) < 3 * self._noise)
-        if share >= self._settings.least_inlier_share:
-            return fitted
-        proposal = five_point(first, second, self._noise)
-        if proposal is None:
-            return fitted
-        other = fit_moving(first, second, weight, *proposal, self._scales, self._noise, nothing, 0.0)
-        other_share = np.mean(np.abs(sampson_residuals(first, second, other[0], other[1])) < 3 * self._noise)
-        return other if other_share > share else fitted
+def _states(steps: list[Step | None], settings: EgoSettings) -> np.ndarray:
+    """(m,) int: index into ``MODES``."""
+    costs = np.zeros((len(steps), len(MODES)))
+    for index, step in enumerate(steps):
+        if step is not None:
+            motion, corners = step.measured
+            costs[index] = (motion.costs - motion.costs.min()) * min(len(corners.ids), 120)
+    return cheapest_path(costs, switch_cost=settings.switch_cost)
 
 
-def _lengths(
-    roads: list[RoadSamples],
+def _signs(steps: list[Step | None], settings: EgoSettings) -> np.ndarray:
+    """(m,) -1 or 1 for each step's own axis."""
+    axes, evidence = np.zeros((len(steps), 3)), np.zeros(len(steps))
+    for index, step in enumerate(steps):
+        if step is not None:
+            motion = step.measured[0]
+            axes[index] = step.pair.axis
+            evidence[index] = motion.evidence * (1.0 if motion.axis @ step.pair.axis >= 0 else -1.0)
+    return travel_signs(axes, evidence, turn_back_cost=settings.turn_back_cost)
+
+
+def _road_of(step: Step | None, sign: float) -> Depths | None:
+    if step is None:
+        return None
+    motion, corners = step.measured
+    sign = sign if motion.axis @ step.pair.axis >= 0 else -sign
+    return road_part(corner_depths(corners, motion, sign=sign))
+
+
+def _road_view(roads: list[Depths | None], states: np.ndarray, height_m: float, pitch_rad: float | None) -> RoadView:
+    if pitch_rad is not None:
+        return RoadView(height_m=height_m, pitch_rad=pitch_rad, pitch_sigma_rad=0.0)
+    seen = [road for road, state in zip(roads, states, strict=True) if road is not None and state == MOVING]
+    pitch, sigma = pooled_pitch(seen)
+    return RoadView(height_m=height_m, pitch_rad=pitch, pitch_sigma_rad=sigma)
+
+
+def _mode_name(step: Step | None, state: int, cut: bool) -> str:
+    if cut:
+        return "cut"
+    return "held" if step is None else MODES[state]
+
+
+def _confidence(step: Step | None, state: int) -> float:
+    """0 to 1: how many corners agree, how many there are, and whether another motion has as many."""
+    if step is None:
+        return 0.0
+    motion = step.measured[0]
+    share = float(motion.inlier_shares[state])
+    agreement = np.clip((share - 0.35) / 0.35, 0.0, 1.0)
+    enough = min(1.0, len(step.corners.ids) / 60.0)
+    undisputed = np.clip(1.5 - 1.5 * motion.second_share / max(share, 1e-3), 0.0, 1.0)
+    return float(agreement * enough * undisputed)
+
+
+def _on_all_frames(
+    tracks: RunTracks,
+    kept: np.ndarray,
+    times: np.ndarray,
+    poses: np.ndarray,
     mode: np.ndarray,
-    times_s: np.ndarray,
-    pitch: float,
-    height_m: float,
-    settings: EgoSettings,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Metres of each step, their relative sigma and where they came from."""
-    count = len(roads)
-    heights, sigma = np.array([step_in_heights(road, pitch) for road in roads]).reshape(-1, 2).T
-    moving = (mode == "moving") | (mode == "held")
-    seen = np.isfinite(sigma) & (heights > 0)
-    source = np.where(seen, "road", "held").astype("<U8")
-    elapsed = np.diff(times_s, prepend=times_s[0])
-    if seen.any():
-        speeds = np.interp(
-            np.arange(count), np.flatnonzero(seen), heights[seen] * height_m / np.maximum(elapsed[seen], 1e-6)
-        )
-        sigma = np.where(seen, sigma, 0.3)
-    else:
-        speeds = np.full(count, settings.default_speed_m_s)
-        source[:], sigma = "default", np.ones(count)
-    return np.where(moving, speeds * elapsed, 0.0), sigma, source
-
-
-def _output_times(times_s: np.ndarray) -> np.ndarray:
-    """The given times, or an even grid over their span where some repeat (a trajectory's times must increase)."""
-    if len(times_s) < 2 or (np.diff(times_s) > 0).all():
-        return times_s.copy()
-    span = max(times_s[-1] - times_s[0], 1e-3 * (len(times_s) - 1))
-    return times_s[0] + np.arange(len(times_s)) * span / (len(times_s) - 1)
+    confidence: np.ndarray,
+    speeds: Speeds,
+    intrinsics: Intrinsics,
+    road: RoadView,
+) -> EgoMotion:
+    """Bring what was found at the shown frames to every frame of the run."""
+    count = len(tracks.frames)
+    out_times = output_times(tracks.times_s)
+    # A frame that shows nothing new belongs to the step that leads past it.
+    owner = np.minimum(np.searchsorted(kept, np.arange(count)), len(kept) - 1)
+    if len(kept) > 1:
+        owner[0] = 1
+    if len(kept) < count or not np.array_equal(times, out_times):
+        poses = interpolated(times, poses, out_times)
+    return EgoMotion(
+        trajectory=rebased_trajectory(out_times, poses),
+        mode=mode[owner], confidence=confidence[owner], scale_source=speeds.source[owner],
+        scale_sigma=speeds.sigma[owner].astype(np.float32), intrinsics=intrinsics, road=road,
+    )  # fmt: skip
