@@ -1,0 +1,409 @@
+"""The synthetic street's still world: ground, road markings, buildings, trees and poles, laid along a path.
+
+Everything is a pure function of the path, the plan and the seed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dataset.street_drives import StreetPath
+from dataset.street_raster import NO_TEXTURE, Polygons, join, make_polygons
+from dataset.street_textures import FACADES, GROUND_FLOORS, TEXTURE_METRES, TextureName, texture_index, texture_size
+
+LANE_WIDTH_M = 3.5
+_MARK_HALF_M = 0.075
+_DASH_M, _GAP_M = 3.0, 6.0
+_WHITE, _YELLOW = (226.0, 226.0, 222.0), (220.0, 182.0, 74.0)
+_BASE_DROP_M = 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaneLine:
+    """A line painted along the road."""
+
+    lateral_m: float
+    """To the right of the camera's path."""
+    dashed: bool
+    yellow: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreetPlan:
+    """The cross-section of the road and what stands beside it; lateral metres, positive to the right."""
+
+    lines: tuple[LaneLine, ...]
+    lanes: tuple[tuple[float, int], ...]
+    """Middle and direction (1 with the camera, -1 against it) of every lane but the camera's own."""
+    left_m: float
+    """Kerb on the left, negative."""
+    right_m: float
+    """Kerb on the right."""
+    pavement_m: float
+    buildings: bool
+    trees: bool
+    wall: bool
+    """A textured wall across the road, 14 m ahead of the camera's start."""
+    column: bool
+    """An advertising column between the lanes, behind which people can disappear."""
+
+
+def plan_street(
+    rng: np.random.Generator, *, parking: bool, buildings: bool, trees: bool, wall: bool = False, column: bool = False
+) -> StreetPlan:
+    """A road of one or two lanes each way with the camera in a lane of the right half."""
+    right_lanes = int(rng.integers(0, 2))
+    left_lanes = int(rng.integers(1, 3))
+    yellow = bool(rng.random() < 0.5)
+    half = LANE_WIDTH_M / 2
+    lines = [LaneLine(lateral_m=-half, dashed=bool(rng.random() < 0.4), yellow=yellow)]
+    lanes = []
+    for index in range(right_lanes):
+        lines.append(LaneLine(lateral_m=half + index * LANE_WIDTH_M, dashed=True, yellow=False))
+        lanes.append(((index + 1) * LANE_WIDTH_M, 1))
+    for index in range(left_lanes):
+        lanes.append((-(index + 1) * LANE_WIDTH_M, -1))
+        if index:
+            lines.append(LaneLine(lateral_m=-half - index * LANE_WIDTH_M, dashed=True, yellow=False))
+    edge_right, edge_left = half + right_lanes * LANE_WIDTH_M, -half - left_lanes * LANE_WIDTH_M
+    lines += [LaneLine(lateral_m=edge, dashed=False, yellow=False) for edge in (edge_right, edge_left)]
+    strip = 2.4 if parking else 0.5
+    return StreetPlan(
+        lines=tuple(lines), lanes=tuple(lanes), left_m=edge_left - strip, right_m=edge_right + strip,
+        pavement_m=float(rng.uniform(2.8, 4.2)), buildings=buildings, trees=trees, wall=wall, column=column,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StillWorld:
+    """Polygons of the still world with what is needed to choose and order them per frame."""
+
+    ground: Polygons
+    """Painted first, in this order."""
+    ground_middle: np.ndarray
+    """(N, 3) float64."""
+    ground_is_base: np.ndarray
+    """(N,) bool: too large to be chosen by its middle."""
+    things: tuple[Polygons, ...]
+    """Houses, trees, poles; the polygons of each in painting order."""
+    thing_middle: np.ndarray
+    """(G, 3) float64."""
+    thing_radius: np.ndarray
+    """(G,) float64."""
+
+
+def build_world(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, *, sun: np.ndarray) -> StillWorld:
+    """The still world along a path."""
+    base = _base_ground(path)
+    ground = join([base, *_ribbons(path, plan), *_markings(path, plan)])
+    things: list[Polygons] = []
+    if plan.buildings:
+        things += _buildings(path, plan, rng, sun)
+    if plan.trees:
+        things += _furniture(path, plan, rng, sun)
+    if plan.wall:
+        things.append(_frontal_wall(path))
+    if plan.column:
+        things.append(_column(path, sun))
+    boxes = np.array([_box(thing) for thing in things]).reshape(-1, 2, 3)
+    return StillWorld(
+        ground=ground, ground_middle=_middles(ground), things=tuple(things),
+        ground_is_base=np.arange(len(ground)) < (len(base) if len(base) == 1 else 0),
+        thing_middle=boxes.mean(axis=1), thing_radius=0.5 * np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=1),
+    )  # fmt: skip
+
+
+def _middles(polygons: Polygons) -> np.ndarray:
+    used = np.arange(polygons.corners.shape[1])[None] < polygons.corner_count[:, None]
+    return (polygons.corners * used[..., None]).sum(axis=1) / polygons.corner_count[:, None]
+
+
+def _box(thing: Polygons) -> tuple[np.ndarray, np.ndarray]:
+    used = np.arange(thing.corners.shape[1])[None] < thing.corner_count[:, None]
+    corners = thing.corners[used].astype(np.float64)
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def ground_gradient(name: TextureName) -> np.ndarray:
+    """(2, 4): a ground texture laid over the street's x and z."""
+    width, height = texture_size(name)
+    metres = TEXTURE_METRES[name]
+    return np.array([[width / metres[0], 0, 0, 0], [0, 0, height / metres[1], 0]], np.float32)
+
+
+def _base_ground(path: StreetPath) -> Polygons:
+    """Grass under everything: one level square, or patches that follow the path's elevation."""
+    gradient = ground_gradient("grass")
+    if np.ptp(path.elevation) < 1e-6:
+        reach = 4000.0
+        square = np.array([(-reach, 0, -reach), (reach, 0, -reach), (reach, 0, reach), (-reach, 0, reach)])
+        return make_polygons([square], texture=texture_index("grass"), gradient=gradient)
+    step = 24.0
+    low = path.points_xz.min(axis=0) - 360
+    nodes = [np.arange(low[axis], path.points_xz[:, axis].max() + 360, step) for axis in (0, 1)]
+    grid = np.stack(np.meshgrid(*nodes, indexing="ij"), -1)
+    knots = path.points_xz[::16]
+    flat = grid.reshape(-1, 2)
+    nearest = np.concatenate([
+        np.argmin(np.linalg.norm(rows[:, None] - knots[None], axis=-1), axis=1) for rows in np.array_split(flat, 64)
+    ])  # fmt: skip
+    height = path.elevation[::16][nearest].reshape(grid.shape[:2]) - _BASE_DROP_M
+    patches = []
+    for i in range(grid.shape[0] - 1):
+        for j in range(grid.shape[1] - 1):
+            ring = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)]
+            corners = np.array([(grid[a][0], -height[a], grid[a][1]) for a in ring])
+            patches += [corners[[0, 1, 2]], corners[[0, 2, 3]]]
+    return make_polygons(patches, texture=texture_index("grass"), gradient=gradient)
+
+
+def _stations(path: StreetPath, start: float, end: float, *, longest: float = 8.0) -> np.ndarray:
+    """Arc lengths that cut the path into pieces, shorter where it bends (chords stay within 1 cm of it)."""
+    out = [start]
+    while out[-1] < end - 1e-6:
+        ahead = np.abs(path.curvature(out[-1] + np.linspace(0, longest, 9))).max()
+        out.append(min(end, out[-1] + min(longest, np.sqrt(8 * 0.01 / max(ahead, 1e-6)))))
+    return np.array(out)
+
+
+def _ribbon(path: StreetPath, arcs: np.ndarray, left: float, right: float) -> list[np.ndarray]:
+    """Quads between two lateral offsets, cut where the inner side of a bend would fold over."""
+    bend = path.curvature(arcs)
+    with np.errstate(divide="ignore"):
+        limit = np.where(np.abs(bend) > 1e-4, 0.92 / np.maximum(np.abs(bend), 1e-9), np.inf)
+    a = np.where(bend < 0, np.maximum(left, -limit), left)
+    b = np.where(bend > 0, np.minimum(right, limit), right)
+    first, _ = path.at(arcs, np.minimum(a, b))
+    second, _ = path.at(arcs, b)
+    return [np.array([first[k], first[k + 1], second[k + 1], second[k]]) for k in range(len(arcs) - 1)]
+
+
+def _ribbons(path: StreetPath, plan: StreetPlan) -> list[Polygons]:
+    arcs = _stations(path, path.start_m + 1, path.end_m - 1)
+    kerb = 0.28
+    layers = [
+        (plan.left_m - plan.pavement_m - 7, plan.right_m + plan.pavement_m + 7, "pavement", (196, 196, 190)),
+        (plan.left_m - plan.pavement_m, plan.right_m + plan.pavement_m, "pavement", (255, 255, 255)),
+        (plan.left_m - kerb, plan.right_m + kerb, "pavement", (268, 266, 262)),
+        (plan.left_m - 0.03, plan.right_m + 0.03, "asphalt", (120, 120, 120)),
+        (plan.left_m, plan.right_m, "asphalt", (255, 255, 255)),
+    ]  # fmt: skip
+    if not plan.buildings:  # In the open the verge is grass.
+        layers = layers[2:]
+    return [
+        make_polygons(
+            _ribbon(path, arcs, left, right), colour=colour, texture=texture_index(name), gradient=ground_gradient(name),
+            grow_px=0.3,
+        )
+        for left, right, name, colour in layers
+    ]  # fmt: skip
+
+
+def _markings(path: StreetPath, plan: StreetPlan) -> list[Polygons]:
+    parts = []
+    for line in plan.lines:
+        edges = (line.lateral_m - _MARK_HALF_M, line.lateral_m + _MARK_HALF_M)
+        quads: list[np.ndarray] = []
+        if line.dashed:
+            for start in np.arange(path.start_m + 1, path.end_m - 8, _DASH_M + _GAP_M):
+                quads += _ribbon(path, _stations(path, start, start + _DASH_M, longest=1.5), *edges)
+        else:
+            quads = _ribbon(path, _stations(path, path.start_m + 1, path.end_m - 1, longest=4.0), *edges)
+        parts.append(make_polygons(quads, colour=_YELLOW if line.yellow else _WHITE, grow_px=0.0))
+    return parts
+
+
+def _shade(normal: np.ndarray, sun: np.ndarray) -> float:
+    return float(0.80 + 0.26 * max(-0.5, normal @ sun))
+
+
+def wall_polygon(
+    foot: np.ndarray, along: np.ndarray, *, width: float, bottom: float, top: float, name: TextureName,
+    tint: np.ndarray, shift_m: float = 0.0,
+) -> Polygons:  # fmt: skip
+    """An upright textured rectangle from ``foot`` (3,) along the unit vector ``along`` (3,); heights above the foot."""
+    up = np.array([0.0, -1.0, 0.0])
+    corners = np.array([
+        foot + up * bottom, foot + along * width + up * bottom, foot + along * width + up * top, foot + up * top
+    ])  # fmt: skip
+    size, metres = texture_size(name), TEXTURE_METRES[name]
+    per_m = (size[0] / metres[0], size[1] / metres[1])
+    gradient = np.array([
+        [*(along * per_m[0]), (shift_m - foot @ along) * per_m[0]],
+        [0, per_m[1], 0, -(foot[1] - bottom) * per_m[1]],
+    ], np.float32)  # fmt: skip
+    return make_polygons([corners], colour=tint, texture=texture_index(name), gradient=gradient)
+
+
+def _building(
+    path: StreetPath, arc: float, side: int, offset: float, width: float, rng: np.random.Generator, sun: np.ndarray
+) -> Polygons:
+    """A house with its front to the road: shop, floors, cornice, and the two walls towards its gaps."""
+    middle, heading = path.at(arc + width / 2, side * offset)
+    forward = np.array([np.sin(heading), 0.0, np.cos(heading)])
+    right = np.array([np.cos(heading), 0.0, -np.sin(heading)])
+    floors = int(rng.integers(2, 6))
+    ground_m, floor_m = 3.6, 3.2
+    top = ground_m + floors * floor_m
+    depth = float(rng.uniform(6, 11))
+    foot = middle - forward * width / 2
+    tint = np.clip(rng.normal(1.0, 0.09) + rng.normal(0, 0.05, 3), 0.7, 1.15) * 255
+    front = tint * _shade(-side * right, sun)
+    name = FACADES[int(rng.integers(len(FACADES)))]
+    below = GROUND_FLOORS[int(rng.random() < 0.45)]
+    shift = float(rng.integers(0, 4)) * 3.2
+    parts = []
+    for start, direction in ((foot, -forward), (foot + forward * width, forward)):
+        parts.append(
+            wall_polygon(start, right * side, width=depth, bottom=0, top=top, name="wall", tint=tint * _shade(direction, sun))
+        )
+    common = {"tint": front, "shift_m": shift}
+    parts.append(wall_polygon(foot, forward, width=width, bottom=ground_m, top=top, name=name, **common))
+    parts.append(wall_polygon(foot, forward, width=width, bottom=0, top=ground_m, name=below, **common))
+    ledge = foot - right * side * 0.05
+    for bottom, high, share in ((ground_m - 0.12, ground_m + 0.12, 0.8), (top - 0.05, top + 0.45, 0.7)):
+        parts.append(
+            wall_polygon(ledge, forward, width=width, bottom=bottom, top=high, name="wall", tint=front * share)
+        )
+    return join(parts)
+
+
+def _buildings(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun: np.ndarray) -> list[Polygons]:
+    houses = []
+    corridor = max(-plan.left_m, plan.right_m) + 1.5
+    for side, kerb in ((-1, -plan.left_m), (1, plan.right_m)):
+        arc = path.start_m + 4
+        while arc < path.end_m - 30:
+            width = float(rng.uniform(9, 17))
+            offset = kerb + plan.pavement_m + float(rng.uniform(0.1, 0.8))
+            bend = float(path.curvature(np.array([arc, arc + width / 2, arc + width])).mean()) * side
+            house = _building(path, arc, side, offset, width, rng, sun)
+            low, high = _box(house)
+            # On the inside of a bend houses would stand in each other; near the road's other stretches, on it.
+            if bend < 0.6 / max(offset, 1.0) and not _on_road(path, low, high, corridor):
+                houses.append(house)
+            arc += width + (0.4 if rng.random() < 0.75 else float(rng.uniform(3, 9)))
+    return houses
+
+
+def _on_road(path: StreetPath, low: np.ndarray, high: np.ndarray, corridor: float) -> bool:
+    """Whether a box on the ground comes nearer to the path than ``corridor``."""
+    inside = np.clip(path.points_xz, low[[0, 2]], high[[0, 2]])
+    return bool((np.linalg.norm(path.points_xz - inside, axis=1) < corridor).any())
+
+
+def _frontal_wall(path: StreetPath) -> Polygons:
+    spot, heading = path.at(14.0)
+    right = np.array([np.cos(heading), 0.0, -np.sin(heading)])
+    common = {"width": 240.0, "tint": np.full(3, 245.0)}
+    foot = spot - right * 120
+    return join([
+        wall_polygon(foot, right, bottom=3.6, top=30.0, name="brick", **common),
+        wall_polygon(foot, right, bottom=0.0, top=3.6, name="shutters", **common),
+    ])  # fmt: skip
+
+
+COLUMN_AHEAD_M, COLUMN_LATERAL_M, COLUMN_RADIUS_M = 8.5, -1.9, 0.7
+"""Where the advertising column stands, from the camera's start."""
+
+
+def _column(path: StreetPath, sun: np.ndarray) -> Polygons:
+    foot, _ = path.at(COLUMN_AHEAD_M, COLUMN_LATERAL_M)
+    post = _prism(foot, radius=COLUMN_RADIUS_M, height=3.0, colour=(200, 196, 184), sun=sun, sides=12)
+    posters = np.array([(198, 66, 58), (232, 204, 90), (66, 120, 168), (236, 232, 222)], np.float32)
+    sheets = _prism(
+        foot - (0.0, 0.7, 0.0), radius=COLUMN_RADIUS_M + 0.01, height=1.8, colour=posters[np.arange(12) % 4], sun=sun,
+        sides=12,
+    )  # fmt: skip
+    return join([post, sheets])
+
+
+def _prism(
+    foot: np.ndarray, *, radius: float, height: float, colour: np.ndarray | tuple[float, float, float], sun: np.ndarray,
+    top_radius: float | None = None, sides: int = 6,
+) -> Polygons:  # fmt: skip
+    """An upright tapered prism; all its sides, so that it can be painted from anywhere (back sides are culled later)."""
+    angle = np.arange(sides + 1) * 2 * np.pi / sides
+    ring = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], -1)
+    upper = foot + ring * (radius if top_radius is None else top_radius) - (0.0, height, 0.0)
+    lower = foot + ring * radius
+    quads = [np.array([lower[k], lower[k + 1], upper[k + 1], upper[k]]) for k in range(sides)]
+    middle = angle[:-1] + np.pi / sides
+    shade = np.array([_shade(np.array([np.cos(m), 0.0, np.sin(m)]), sun) for m in middle])
+    return make_polygons(quads, colour=np.asarray(colour, np.float32) * shade[:, None].astype(np.float32), grow_px=0.4)
+
+
+def _blob(centre: np.ndarray, radius: float, rng: np.random.Generator, sun: np.ndarray, green: np.ndarray) -> Polygons:
+    """A crown: a ball of triangles with shades of leaf, slightly out of round."""
+    rows, around = 5, 9
+    polar = np.linspace(0, np.pi, rows + 1)
+    turn = np.arange(around) * 2 * np.pi / around
+    nodes = np.stack([
+        np.sin(polar)[:, None] * np.cos(turn), np.broadcast_to(-np.cos(polar)[:, None] * 0.9, (rows + 1, around)),
+        np.sin(polar)[:, None] * np.sin(turn),
+    ], -1)  # fmt: skip
+    size = radius * rng.uniform(0.86, 1.1, (rows + 1, around))
+    size[0], size[-1] = size[0, 0], size[-1, 0]
+    nodes = centre + nodes * size[..., None]
+    triangles = []
+    for row in range(rows):
+        for k in range(around):
+            a, b = nodes[row, k], nodes[row, (k + 1) % around]
+            c, d = nodes[row + 1, (k + 1) % around], nodes[row + 1, k]
+            triangles += [[a, b, c]] * (row > 0) + [[a, c, d]] * (row < rows - 1)
+    faces = np.array(triangles)
+    normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    inward = np.einsum("ij,ij->i", normal, faces.mean(axis=1) - centre) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    normal[inward] *= -1
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    shade = 0.66 + 0.34 * np.clip(normal @ sun, -0.6, 1) + rng.normal(0, 0.07, len(faces))
+    return make_polygons(list(faces), colour=green * shade[:, None], grow_px=0.4)
+
+
+def _tree(spot: np.ndarray, rng: np.random.Generator, sun: np.ndarray) -> Polygons:
+    height = float(rng.uniform(2.2, 3.2))
+    green = np.array([78, 108, 52]) * rng.uniform(0.85, 1.2) + rng.normal(0, 6, 3)
+    parts = [_prism(spot, radius=0.16, top_radius=0.10, height=height + 0.6, colour=(96, 78, 62), sun=sun)]
+    for _ in range(3):
+        centre = spot + (rng.normal(0, 0.45), -height - rng.uniform(0.5, 1.8), rng.normal(0, 0.45))
+        parts.append(_blob(centre, float(rng.uniform(1.0, 1.5)), rng, sun, green))
+    return join(parts)
+
+
+def _lamp(spot: np.ndarray, to_road: np.ndarray, sun: np.ndarray) -> Polygons:
+    grey = (92.0, 98.0, 100.0)
+    pole = _prism(spot, radius=0.085, top_radius=0.055, height=6.4, colour=grey, sun=sun)
+    tip = spot - (0.0, 6.35, 0.0)
+    side = np.array([to_road[2], 0.0, -to_road[0]])
+    arm = [np.array([tip, tip + to_road * 1.6, tip + to_road * 1.6 + (0, 0.1, 0), tip + (0, 0.1, 0)])]
+    head = tip + to_road * 1.5
+    lamp = [np.array([head - side * 0.12, head + side * 0.12, head + side * 0.12 + to_road * 0.6, head - side * 0.12 + to_road * 0.6])]
+    arm += [arm[0][::-1]]
+    lamp += [lamp[0][::-1]]
+    return join([pole, make_polygons(arm, colour=grey), make_polygons(lamp, colour=(236.0, 232.0, 214.0))])
+
+
+def _furniture(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun: np.ndarray) -> list[Polygons]:
+    """Trees and lamps along both kerbs, never on another stretch of the road."""
+    things = []
+    corridor = min(-plan.left_m, plan.right_m) + 0.2
+    for side, kerb in ((-1, -plan.left_m), (1, plan.right_m)):
+        arc = path.start_m + 6 + float(rng.uniform(0, 8))
+        while arc < path.end_m - 10:
+            lamp = rng.random() < 0.3
+            spot, heading = path.at(arc, side * (kerb + (0.6 if plan.buildings else float(rng.uniform(1.0, 6.0)))))
+            right = np.array([np.cos(heading), 0.0, -np.sin(heading)])
+            thing = _lamp(spot, -side * right, sun) if lamp else _tree(spot, rng, sun)
+            bends = float(path.curvature(np.array(arc))) * side
+            if bends < 0.5 / kerb and not _on_road(path, spot - 0.1, spot + 0.1, corridor):
+                things.append(thing)
+            arc += float(rng.uniform(9, 17))
+    return things
+
+
+def facing(polygons: Polygons, eye: np.ndarray) -> np.ndarray:
+    """(N,) bool: textured walls always; flat-coloured faces only where they turn towards ``eye``."""
+    a, b, c = polygons.corners[:, 0], polygons.corners[:, 1], polygons.corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    return (polygons.texture != NO_TEXTURE) | (np.einsum("ij,ij->i", normal, a - eye) < 0)
