@@ -8,6 +8,7 @@ Switching changes flags only: the base weights are never merged, so switching of
 """
 
 import json
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +72,10 @@ def attach_adapter(denoiser: torch.nn.Module, name: str, config: AdapterConfig) 
 
 def _inject(denoiser: torch.nn.Module, name: str, lora: LoraConfig) -> None:
     try:
-        inject_adapter_in_model(lora, denoiser, name)
+        with warnings.catch_warnings():
+            # Several adapters on one network is what we want; PEFT warns of it.
+            warnings.filterwarnings("ignore", message="Already found a `peft_config`")
+            inject_adapter_in_model(lora, denoiser, name)
     except ValueError as error:
         raise ModelError(f"the adapter does not fit the network: {str(error).splitlines()[0]}") from error
     # Stock diffusers asks the model for its adapters' configurations.

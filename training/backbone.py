@@ -6,13 +6,15 @@ D text channels, T video frames.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
 
 from labeling.errors import ConfigError
-from training.config import BackboneConfig
+from training.adapters import AdapterFile
+from training.config import AdapterConfig, BackboneConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,8 +125,30 @@ class Backbone(Protocol):
 
     config: BackboneConfig
     geometry: LatentGeometry
-    denoiser: torch.nn.Module
-    """The network that carries the adapters."""
+    device: torch.device
+    adapter_prefix: str
+    """Of the adapter files' keys: ``transformer`` or ``unet``."""
+
+    @property
+    def denoiser(self) -> torch.nn.Module:
+        """The network that carries the adapters."""
+        ...
+
+    def attach(self, name: str, config: AdapterConfig) -> list[torch.nn.Parameter]:
+        """A fresh trainable adapter, active; its parameters."""
+        ...
+
+    def load_adapter(self, path: Path, name: str) -> AdapterFile:
+        """An adapter file, not active."""
+        ...
+
+    def release(self, parts: Sequence[str]) -> None:
+        """Forget parts (``vae``, ``text``); they load again when used."""
+        ...
+
+    def fingerprint_vae(self) -> str:
+        """The fingerprint's part ``vae``."""
+        ...
 
     def encode_video(self, frames_THWC: np.ndarray) -> torch.Tensor:
         """(T, H, W, 3) uint8 RGB to (C, F, H, W) normalised latents, on the CPU; no randomness."""

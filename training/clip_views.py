@@ -9,8 +9,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from labeling.camera import Trajectory, rebased_trajectory
-from labeling.ego_video import ego_frames
+from labeling.camera import Intrinsics, Trajectory, rebased_trajectory
 from labeling.errors import ConfigError, DataError
 from labeling.labels import Keypoints
 from labeling.object_video import object_frames
@@ -18,6 +17,7 @@ from labeling.skeleton_video import draw_skeletons, lit_cells
 from labeling.timeline import Span
 from training.backbone import LatentGeometry
 from training.config import PictureConfig
+from training.sampling_inputs import ego_clip
 from training.stages import RGB
 from training.targeted_noise import latent_mask
 
@@ -47,6 +47,8 @@ class ClipViews:
     """(T,) frames of the clip."""
     label_width: int
     label_height: int
+    intrinsics: Intrinsics | None = None
+    """The camera's; without them the ego video takes the prior's."""
 
     def per_frame(self) -> list[list[Keypoints]]:
         """The labels of each frame that is kept."""
@@ -75,7 +77,7 @@ class ClipViews:
     def ego(self) -> np.ndarray:
         """(T, H, W, 3), rendered afresh."""
         trajectory = clip_trajectory(self.sample.cam_to_world[self.indices], fps=self.picture.fps)
-        return ego_clip(trajectory, picture=self.picture)
+        return ego_clip(trajectory, picture=self.picture, intrinsics=self.intrinsics)
 
     def objects(self, variant: int) -> np.ndarray:
         """(T, H, W, 3), drawn afresh."""
@@ -100,11 +102,6 @@ class ClipViews:
             "width": self.picture.control_width, "height": self.picture.control_height,
             "label_width": self.label_width, "label_height": self.label_height,
         }  # fmt: skip
-
-
-def ego_clip(trajectory: Trajectory, *, picture: PictureConfig) -> np.ndarray:
-    """(T, H, W, 3): the ego video of a trajectory at the controls' size; the same for training and sampling."""
-    return np.stack(list(ego_frames(trajectory, width=picture.control_width, height=picture.control_height)))
 
 
 def clip_trajectory(cam_to_world: np.ndarray, *, fps: float) -> Trajectory:

@@ -38,6 +38,8 @@ class PictureConfig(_Settings):
     """Every n-th frame of the clip: 2 makes 12 fps of 24."""
     clip_fps: float = 24.0
     """Frame rate of the clips in the shards."""
+    ego_style: Literal["world", "released"] = "world"
+    """``released`` for the released adapters only."""
 
     @property
     def fps(self) -> float:

@@ -19,6 +19,7 @@ import torch
 from safetensors.torch import save
 
 from dataset.receipts import digest, hashed_share, storage_errors, sync_folder
+from labeling.camera import Intrinsics
 from labeling.errors import ConfigError, DataError
 from labeling.skeleton_video import DEFAULT_STYLE
 from training.backbone import Backbone, load_backbone
@@ -189,9 +190,11 @@ def encode_clip(
     """All latents of one clip by name, in the storage type, and the skeleton's mask as uint8."""
     picture = backbone.config.picture.model_copy(update={"frames": manifest.frames})
     meta = sample.meta
+    size, camera = meta.get("picture", meta), meta.get("intrinsics")
     views = ClipViews(
         sample=sample, picture=picture, indices=frame_indices(len(sample.cam_to_world), picture),
-        label_width=int(meta.get("width", 1056)), label_height=int(meta.get("height", 704)),
+        label_width=int(size.get("width", 1056)), label_height=int(size.get("height", 704)),
+        intrinsics=Intrinsics(**camera) if camera else None,
     )  # fmt: skip
     dtype = getattr(torch, backbone.config.latent_dtype)
     tensors = {

@@ -14,9 +14,10 @@ from diffusers.models.autoencoders.autoencoder_kl_ltx import AutoencoderKLLTXVid
 from diffusers.models.transformers.transformer_ltx import LTXVideoTransformer3DModel
 
 from labeling.errors import ModelError
+from training.adapters import AdapterFile, attach_adapter, load_adapter
 from training.backbone import LatentGeometry, SamplingSettings, StageInputs, TextEmbedding, pad_text
 from training.conditioning import TIMESTEP_SCALE, TokenSequence, assemble_tokens, pack, sequence_tokens, unpack
-from training.config import BackboneConfig
+from training.config import AdapterConfig, BackboneConfig
 from training.flow import (
     Convention,
     interpolate,
@@ -40,6 +41,8 @@ DECODE_TIMESTEP, DECODE_NOISE = 0.05, 0.025
 
 class LtxBackbone:
     """See ``training.backbone.Backbone``."""
+
+    adapter_prefix = "transformer"
 
     def __init__(
         self,
@@ -67,6 +70,19 @@ class LtxBackbone:
                     module.eval().requires_grad_(False)
             self._parts[name] = part
         return self._parts[name]
+
+    def release(self, parts: Sequence[str]) -> None:
+        """Forget parts; they load again when used."""
+        for name in parts:
+            self._parts.pop(name, None)
+
+    def attach(self, name: str, config: AdapterConfig) -> list[torch.nn.Parameter]:
+        """A fresh trainable adapter, active; its parameters."""
+        return attach_adapter(self.denoiser, name, config)
+
+    def load_adapter(self, path: Path, name: str) -> AdapterFile:
+        """An adapter file, not active."""
+        return load_adapter(self.denoiser, path, name)
 
     def preload(self, parts: Sequence[str]) -> None:
         """Load these parts now."""

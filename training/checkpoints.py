@@ -1,0 +1,101 @@
+"""Checkpoints: staged in a hidden folder, synced, the manifest last, then renamed. One that is torn is never loaded.
+
+<out>/checkpoints/step_00000020/  adapter.safetensors  optimiser.safetensors  state.json  manifest.json
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+from dataset.receipts import storage_errors, sync_folder
+from labeling.errors import DataError
+
+MANIFEST = "manifest.json"
+
+
+def checkpoint_folder(root: Path, step: int) -> Path:
+    """Where the checkpoint of a step lies."""
+    return root / f"step_{step:08d}"
+
+
+def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes], *, keep: int) -> Path:
+    """Write a checkpoint and drop all but the newest ``keep``.
+
+    Raises:
+        StorageError: no space left, or the folder cannot be written to; earlier checkpoints are untouched.
+    """
+    goal, staged = checkpoint_folder(root, step), root / f".step_{step:08d}.{os.getpid()}"
+    with storage_errors(root):
+        shutil.rmtree(staged, ignore_errors=True)
+        staged.mkdir(parents=True)
+        try:
+            listed = {
+                name: {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in files.items()
+            }
+            for name, data in files.items():
+                _write_synced(staged / name, data)
+            _write_synced(staged / MANIFEST, json.dumps({"step": step, "files": listed}, sort_keys=True).encode())
+            sync_folder(staged)
+            shutil.rmtree(goal, ignore_errors=True)
+            staged.rename(goal)
+            sync_folder(root)
+        finally:
+            shutil.rmtree(staged, ignore_errors=True)
+        _prune(root, keep=keep)
+    return goal
+
+
+def _write_synced(path: Path, data: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _prune(root: Path, *, keep: int) -> None:
+    for path in list_checkpoints(root)[:-keep]:
+        shutil.rmtree(path, ignore_errors=True)
+    for leftover in root.glob(".step_*"):
+        shutil.rmtree(leftover, ignore_errors=True)
+
+
+def list_checkpoints(root: Path) -> list[Path]:
+    """Checkpoint folders by step, oldest first; whether they are whole is not looked at."""
+    return sorted(path for path in root.glob("step_*") if path.is_dir())
+
+
+def check_checkpoint(path: Path) -> int:
+    """The step of a whole checkpoint.
+
+    Raises:
+        DataError: a file is missing, cut short or changed.
+    """
+    try:
+        manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        step, files = int(manifest["step"]), dict(manifest["files"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} has no whole manifest ({type(error).__name__}); it was not finished") from error
+    for name, wanted in files.items():
+        file = path / name
+        if not file.is_file() or file.stat().st_size != wanted["size"]:
+            raise DataError(f"{path}: {name} is missing or cut short; take an earlier checkpoint")
+        with file.open("rb") as stream:
+            if hashlib.file_digest(stream, "sha256").hexdigest() != wanted["sha256"]:
+                raise DataError(f"{path}: {name} does not match its manifest; take an earlier checkpoint")
+    return step
+
+
+def newest_checkpoint(root: Path) -> Path | None:
+    """The newest whole checkpoint; torn ones are skipped with a warning. None where there is none."""
+    for path in reversed(list_checkpoints(root)):
+        try:
+            check_checkpoint(path)
+        except DataError as error:
+            warnings.warn(f"skipping a torn checkpoint: {error}", stacklevel=2)
+            continue
+        return path
+    return None

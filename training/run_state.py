@@ -1,0 +1,120 @@
+"""A run's state as checkpoint files: adapter, optimiser moments, and the step with the data order, all plain data."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file, save
+
+from labeling.errors import DataError
+from training.adapters import adapter_bytes, put_adapter, read_adapter
+from training.config import TrainConfig
+
+ADAPTER, OPTIMISER, STATE = "adapter.safetensors", "optimiser.safetensors", "state.json"
+_MOMENTS = ("exp_avg", "exp_avg_sq", "step")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunState:
+    """Where a run stands. The learning rate and every draw follow from the step, so there is no more."""
+
+    step: int
+    """Optimiser steps done."""
+    loader: dict[str, Any]
+    """``StatefulDataLoader``'s state."""
+    loader_start: int
+    """The step that the loader's order began at."""
+    layout: dict[str, int]
+    """Processes, workers, micro-batch, global batch: the loader's state holds for the same ones only."""
+    config: dict[str, Any]
+
+
+def pack_state(
+    denoiser: torch.nn.Module, optimiser: torch.optim.Optimizer, names: Sequence[str], *, config: TrainConfig,
+    state: RunState, frames: int, prefix: str = "transformer",
+) -> dict[str, bytes]:  # fmt: skip
+    """Checkpoint files by name.
+
+    Args:
+        denoiser: carries the adapter, named by the stage.
+        optimiser: over the parameters ``names``, in one group.
+        names: of the parameters, in the optimiser's order.
+        config: the run's.
+        state: step and data order.
+        frames: video frames per clip that it was trained on.
+        prefix: of the adapter's keys.
+    """
+    about = {"stage": config.stage, "step": state.step, "frames": frames, "config": config.model_dump(mode="json")}
+    return {
+        ADAPTER: adapter_bytes(denoiser, config.stage, config.adapter, about=about, prefix=prefix),
+        OPTIMISER: save(_moments(optimiser, names)),
+        STATE: json.dumps(
+            {
+                "step": state.step, "loader": state.loader, "loader_start": state.loader_start,
+                "layout": state.layout, "config": state.config,
+            },
+            sort_keys=True,
+        ).encode(),
+    }  # fmt: skip
+
+
+def _moments(optimiser: torch.optim.Optimizer, names: Sequence[str]) -> dict[str, torch.Tensor]:
+    parameters = optimiser.param_groups[0]["params"]
+    tensors = {}
+    for name, parameter in zip(names, parameters, strict=True):
+        for kind in _MOMENTS:
+            if kind in optimiser.state[parameter]:
+                tensors[f"{kind}/{name}"] = optimiser.state[parameter][kind].detach().cpu().contiguous()
+    return tensors
+
+
+def read_state(checkpoint: Path) -> RunState:
+    """The state of a whole checkpoint.
+
+    Raises:
+        DataError: it is not what this version writes.
+    """
+    try:
+        return RunState(**json.loads((checkpoint / STATE).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise DataError(f"{checkpoint / STATE} is no run state ({error}); start afresh with --resume never") from error
+
+
+def restore(
+    checkpoint: Path, denoiser: torch.nn.Module, optimiser: torch.optim.Optimizer, names: Sequence[str], *, adapter: str
+) -> None:
+    """Put a checkpoint's adapter and moments back.
+
+    Raises:
+        ModelError: the adapter does not fit.
+        DataError: moments are missing.
+    """
+    file = read_adapter(checkpoint / ADAPTER)
+    put_adapter(denoiser, adapter, file.tensors | file.extra, source=str(checkpoint))
+    tensors = load_file(checkpoint / OPTIMISER)
+    for name, parameter in zip(names, optimiser.param_groups[0]["params"], strict=True):
+        moments = {kind: tensors[f"{kind}/{name}"] for kind in _MOMENTS if f"{kind}/{name}" in tensors}
+        if tensors and len(moments) != len(_MOMENTS):
+            raise DataError(f"{checkpoint / OPTIMISER} lacks the moments of {name}; start afresh with --resume never")
+        if moments:
+            # AdamW keeps its step counter on the CPU unless it is fused.
+            optimiser.state[parameter] = {
+                kind: value if kind == "step" else value.to(parameter.device) for kind, value in moments.items()
+            }
+
+
+def config_differences(held: Mapping[str, Any], config: TrainConfig) -> list[str]:
+    """Settings that a resume must not change, where they do: everything that moves the losses."""
+    now = config.model_dump(mode="json")
+    watched = ("stage", "adapter", "conditions", "targeted_noise", "seed")
+    differences = [name for name in watched if held.get(name) != now[name]]
+    for name in ("name", "kind", "weights"):
+        if held.get("backbone", {}).get(name) != now["backbone"][name]:
+            differences.append(f"backbone.{name}")
+    for name, value in now["optimiser"].items():
+        if name != "micro_batch" and held.get("optimiser", {}).get(name) != value:
+            differences.append(f"optimiser.{name}")
+    return differences

@@ -1,0 +1,152 @@
+"""What a person gives to the generator, as frames of the right size: image, first skeleton, ego and object video."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from dataset.tables import read_keypoints
+from labeling.camera import Intrinsics, Trajectory, cover_map, read_kitti, read_tum, resample
+from labeling.ego_video import ego_frames
+from labeling.errors import ConfigError, DataError
+from labeling.labels import Keypoints
+from labeling.object_video import object_frames
+from labeling.skeleton_video import draw_skeletons
+from labeling.timeline import Span
+from labeling.video import read_frames
+from training.config import PictureConfig
+from training.ego_recipes import recipe_trajectory
+
+LABEL_WIDTH = 1056
+"""Extractors look at pictures this wide, whatever the backbone's size."""
+
+
+def read_image(path: Path) -> np.ndarray:
+    """(H, W, 3) uint8 RGB.
+
+    Raises:
+        DataError: no picture there.
+    """
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise DataError(f"{path} is not a picture that can be read; give a PNG or JPEG")
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def covered(picture: np.ndarray, *, width: int, height: int) -> np.ndarray:
+    """A picture scaled to cover the size and centre-cropped, as source videos are."""
+    plan = cover_map(picture.shape[1], picture.shape[0], width=width, height=height)
+    shrinks = plan.scaled_width < picture.shape[1]
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    scaled = cv2.resize(picture, (plan.scaled_width, plan.scaled_height), interpolation=method)
+    return scaled[plan.crop_y : plan.crop_y + height, plan.crop_x : plan.crop_x + width]
+
+
+def fitted(frames: np.ndarray, *, width: int, height: int) -> np.ndarray:
+    """Control frames (T, H, W, 3) at another size, without mixing their colours."""
+    if frames.shape[1:3] == (height, width):
+        return frames
+    return np.stack([cv2.resize(one, (width, height), interpolation=cv2.INTER_NEAREST) for one in frames])
+
+
+def first_skeleton(
+    image: np.ndarray,
+    *,
+    picture: PictureConfig,
+    extractors: Sequence[str] | None = None,
+    models_dir: Path | None = None,
+) -> np.ndarray:
+    """(H, W, 3): the skeletons that the extractors see in the image, drawn at the controls' size.
+
+    Args:
+        image: (H, W, 3) uint8 RGB, any size.
+        picture: the backbone's sizes.
+        extractors: model cards by name, ``street`` for the shipped ones; None for all whose weights are there.
+        models_dir: where weights lie.
+
+    Raises:
+        ConfigError: no extractor at all.
+    """
+    from labeling.extractors import Extractors, choose_extractors
+    from labeling.observation import looks_of
+
+    choice = choose_extractors(extractors, models_dir=models_dir)
+    if not choice.cards:
+        raise ConfigError(
+            "there are no extractors to find the first skeleton with; give it (--skeleton FILE), or weights (--models "
+            "DIR, or --extractors street for the shipped ones); `animatic models` lists them"
+        )
+    height = 2 * round(LABEL_WIDTH * picture.rgb_height / picture.rgb_width / 2)
+    seen = covered(image, width=LABEL_WIDTH, height=height)
+    looks = looks_of(Extractors(choice, models_dir=models_dir))
+    labels: list[Keypoints] = [label for look in looks for label in look.see(seen, 0)]
+    return draw_skeletons(
+        labels, width=picture.control_width, height=picture.control_height, label_width=LABEL_WIDTH, label_height=height
+    )
+
+
+def ego_trajectory(source: str | Path | Trajectory, *, frames: int, fps: float) -> Trajectory:
+    """A trajectory of ``frames`` poses from a recipe, a TUM or KITTI file, an (T, 4, 4) ``.npy``, or one at hand.
+
+    Raises:
+        ConfigError: neither a file nor a recipe, or the file is too short.
+    """
+    if isinstance(source, Trajectory):
+        given = source
+    elif Path(source).suffix == ".npy" and Path(source).is_file():
+        poses = np.load(source, allow_pickle=False)
+        from labeling.camera import rebased_trajectory
+
+        given = rebased_trajectory(np.arange(len(poses)) / fps, poses)
+    elif Path(source).is_file():
+        given = read_tum(Path(source)) if Path(source).suffix == ".tum" else read_kitti(Path(source), fps=fps)
+    else:
+        return recipe_trajectory(str(source), frames=frames, fps=fps)
+    wanted = given.timestamps_s[0] + np.arange(frames) / fps
+    if wanted[-1] > given.timestamps_s[-1] + 0.5 / fps:
+        raise ConfigError(
+            f"the trajectory lasts {given.timestamps_s[-1] - given.timestamps_s[0]:.2f} s, the clip "
+            f"{(frames - 1) / fps:.2f} s; give a longer one"
+        )
+    return resample(given, np.minimum(wanted, given.timestamps_s[-1]))
+
+
+def ego_clip(trajectory: Trajectory, *, picture: PictureConfig, intrinsics: Intrinsics | None = None) -> np.ndarray:
+    """(T, H, W, 3): the ego video at the controls' size; the same for training and sampling."""
+    frames = ego_frames(
+        trajectory, width=picture.control_width, height=picture.control_height, intrinsics=intrinsics,
+        style=picture.ego_style,
+    )  # fmt: skip
+    return np.stack(list(frames))
+
+
+def object_clip(
+    source: Path, *, frames: int, picture: PictureConfig, key: str = "given", variant: int = 0
+) -> np.ndarray:
+    """(T, H, W, 3): an object video from an MP4, or drawn from a Parquet table of labels.
+
+    Raises:
+        ConfigError: too short.
+        VideoError: not a video.
+    """
+    size = {"width": picture.control_width, "height": picture.control_height}
+    if source.suffix == ".parquet":
+        labels = read_keypoints(source)
+        start = min((label.frame for label in labels), default=0)
+        span = Span(start=start, end=start + frames * picture.frame_step)
+        return np.stack(list(object_frames(labels, clip=span, key=key, variant=variant, **size)))[:: picture.frame_step]
+    return control_clip(source, frames=frames, picture=picture)
+
+
+def control_clip(source: Path, *, frames: int, picture: PictureConfig) -> np.ndarray:
+    """(T, H, W, 3): a control video file at the controls' size, every ``frame_step``-th frame.
+
+    Raises:
+        ConfigError: too short.
+        VideoError: not a video.
+    """
+    found = np.stack(list(read_frames(source)))[:: picture.frame_step]
+    if len(found) < frames:
+        raise ConfigError(f"{source} gives {len(found)} frames, the clip needs {frames}; give a longer one")
+    return fitted(found[:frames], width=picture.control_width, height=picture.control_height)
