@@ -72,8 +72,9 @@ class PlainDecoder:
             other = links[rest[0], 3:]
             if math.dist(first[:2], other[:2]) <= max(first[2], 4.0):
                 pair = scores[[best, rest[0]]]
-                return *(pair @ np.stack([first, other]) / pair.sum()), pair.mean()
-        return *first, 0.5 * scores[best]
+                x, y, scale = pair @ np.stack([first, other]) / pair.sum()
+                return x, y, scale, float(pair.mean())
+        return first[0], first[1], first[2], 0.5 * float(scores[best])
 
     def _grow(self, k: int, x: float, y: float, scale: float, score: float) -> np.ndarray:
         points = np.zeros((self.table.point_count, 4))
