@@ -20,6 +20,7 @@ from dataset.shards import Member, find_shards, iterate_keys, read_member, read_
 from dataset.tables import keypoints_from_table
 from labeling.errors import DataError
 from labeling.labels import Keypoints
+from labeling.video import read_frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,12 +66,14 @@ class Sample:
 
     def frames(self, suffix: str) -> np.ndarray:
         """(T, H, W, 3) uint8 RGB frames of a video member, as ``rgb.mp4``."""
-        from labeling.video import read_frames
+        return np.stack(list(self.iterate_frames(suffix)))
 
+    def iterate_frames(self, suffix: str) -> Iterator[np.ndarray]:
+        """(H, W, 3) uint8 RGB frames of a video member, one at a time."""
         with tempfile.NamedTemporaryFile(suffix=".mp4") as file:
             file.write(self.member(suffix))
             file.flush()
-            return np.stack(list(read_frames(Path(file.name))))
+            yield from read_frames(Path(file.name))
 
 
 class ShardDataset:

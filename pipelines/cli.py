@@ -16,6 +16,10 @@ app = typer.Typer(
 LABEL, STAGES, LOOK, TRAIN, MEASURE = "Label videos", "Single stages", "Look", "Train and sample", "Measure"
 
 Videos = Annotated[list[Path], typer.Argument(help="Video files, folders of them, or text files of paths.")]
+MoreVideos = Annotated[
+    list[Path] | None,
+    typer.Argument(help="Video files, folders of them, or text files of paths; a job that is there keeps its own."),
+]
 Out = Annotated[Path, typer.Option("--out", "-o", help="The job's folder.")]
 JobFolder = Annotated[Path, typer.Argument(help="The job's folder.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Settings in YAML.")]
@@ -53,8 +57,8 @@ def main() -> None:
 
 @app.command(rich_help_panel=LABEL)
 def label(
-    videos: Videos,
     out: Out,
+    videos: MoreVideos = None,
     config: ConfigFile = None,
     effort: Effort = None,
     keep_share: KeepShare = None,
@@ -75,7 +79,7 @@ def label(
         config=config, effort=effort, keep_share=keep_share, models=models, extractors=extractors, videos=videos_kept,
         captions=captions, split=split, leave_out=leave_out, workers=workers, part=part, wait_minutes=wait,
     )  # fmt: skip
-    raise typer.Exit(run_label(videos, out, options))
+    raise typer.Exit(run_label(videos or [], out, options))
 
 
 @app.command(name="slice", rich_help_panel=LABEL)
@@ -109,7 +113,7 @@ def _stage_command(name: str, text: str) -> None:
 
 @app.command(rich_help_panel=STAGES)
 def index(
-    out: Out, videos: Annotated[list[Path] | None, typer.Argument()] = None, config: ConfigFile = None,
+    out: Out, videos: MoreVideos = None, config: ConfigFile = None,
     models: Models = None, keep_share: KeepShare = None, extractors: Extractors = None, leave_out: LeaveOut = None,
     workers: Workers = None, part: PartOf = None,
 ) -> None:  # fmt: skip
@@ -147,3 +151,53 @@ for _name, _text in (
     ("pack", "Shards and their index."),
 ):
     _stage_command(_name, _text)
+
+
+@app.command(rich_help_panel=LOOK)
+def status(job: JobFolder, as_json: AsJson = False) -> None:
+    """What is done, dropped and failed, stage by stage, and what to type next."""
+    from pipelines.status import print_status
+
+    raise typer.Exit(print_status(job, as_json=as_json))
+
+
+@app.command(rich_help_panel=LOOK)
+def inspect(
+    job: JobFolder,
+    key: Annotated[str | None, typer.Argument(help="A clip; without one, the whole dataset in numbers.")] = None,
+    sheet: Annotated[Path | None, typer.Option(help="Write the clip's contact sheet here.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """The dataset in numbers, or one clip's record and contact sheet."""
+    from pipelines.status import inspect as inspect_job
+
+    raise typer.Exit(inspect_job(job, key, sheet=sheet, as_json=as_json))
+
+
+@app.command(rich_help_panel=LOOK)
+def models(models: Models = None, as_json: AsJson = False) -> None:
+    """The model cards, which weights are present, and how to get the others."""
+    from pipelines.models import print_models
+
+    raise typer.Exit(print_models(models, as_json=as_json))
+
+
+export_app = typer.Typer(help="Write a packed job in other forms.", no_args_is_help=True)
+app.add_typer(export_app, name="export", rich_help_panel=LOOK)
+
+
+@export_app.callback()
+def _export() -> None:
+    """Write a packed job in other forms."""
+
+
+@export_app.command("released")
+def export_released(
+    job: JobFolder,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the manifest and its loose files.")],
+    split: Annotated[str, typer.Option(help="train or val.")] = "train",
+) -> None:
+    """The released trainer's JSONL (id, caption, rgb_path, pose_path) with loose files."""
+    from pipelines.export import export_released as export
+
+    raise typer.Exit(export(job, out, split=split))

@@ -1,0 +1,253 @@
+"""``animatic status`` and ``animatic inspect``: what is done, dropped and failed, and what to type next."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from dataset.inspection import Spread, Summary, clip_record, clip_verdict, summarize, write_contact_sheet
+from dataset.loader import ShardDataset
+from dataset.receipts import read_receipts, reason_counts
+from dataset.selection import read_selection
+from labeling.errors import AnimaticError, ConfigError, DataError
+from pipelines.console import file_size, make_console
+from pipelines.job import Job, open_job
+from pipelines.layout import SELECTION
+from pipelines.stage import COMMAND_STAGES, NotReadyError, item_state
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageStatus:
+    """How far one stage has come."""
+
+    stage: str
+    items: int | None
+    """How many there should be; None where an earlier stage must end first."""
+    done: int = 0
+    pending: int = 0
+    """Never made, or out of date."""
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    """By reason."""
+    failed: Mapping[str, int] = field(default_factory=dict)
+    """By reason, for good."""
+    retryable: Mapping[str, int] = field(default_factory=dict)
+    """By reason, to be tried again."""
+    waits_for: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobStatus:
+    """How far a job has come, and what to type next."""
+
+    root: str
+    videos: int
+    stages: tuple[StageStatus, ...]
+    clips: Mapping[str, int]
+    """Clips kept and dropped by the selection, by reason."""
+    next_command: str
+    next_reason: str
+
+
+def job_status(root: Path) -> JobStatus:
+    """The status of a job, from its receipts alone.
+
+    Raises:
+        ConfigError: no job there.
+    """
+    job = open_job(root)
+    stages = tuple(stage_status(job, name) for names in COMMAND_STAGES.values() for name in names)
+    command, reason = _next(root, stages)
+    return JobStatus(
+        root=str(root), videos=len(job.sources), stages=stages, clips=_selected(root), next_command=command,
+        next_reason=reason,
+    )  # fmt: skip
+
+
+def stage_status(job: Job, name: str) -> StageStatus:
+    """One stage's counts; its plan says what there should be, its receipts what there is."""
+    known = job.receipts(name)
+    try:
+        items = job.plan(name)
+    except NotReadyError as error:
+        return StageStatus(stage=name, items=None, waits_for=str(error))
+    except AnimaticError as error:
+        return StageStatus(stage=name, items=None, waits_for=str(error))
+    states = {item.name: item_state(item, known.get(item.name), job.root) for item in items}
+    settled = [known[name] for name, state in states.items() if state in ("current", "retry")]
+    failed = [receipt for receipt in settled if receipt.state == "failed"]
+    return StageStatus(
+        stage=name, items=len(items), done=sum(receipt.state == "done" for receipt in settled),
+        pending=sum(state in ("missing", "stale") for state in states.values()),
+        dropped=reason_counts(receipt.reason for receipt in settled if receipt.state == "dropped"),
+        failed=reason_counts(receipt.reason for receipt in failed if not receipt.retryable),
+        retryable=reason_counts(receipt.reason for receipt in failed if receipt.retryable),
+    )  # fmt: skip
+
+
+def _selected(root: Path) -> dict[str, int]:
+    try:
+        rows = read_selection(root / SELECTION).rows
+    except DataError:
+        return {}
+    dropped = reason_counts(row.reason or "" for row in rows if not row.kept)
+    return {"kept": sum(row.kept for row in rows), **dropped}
+
+
+def _next(root: Path, stages: tuple[StageStatus, ...]) -> tuple[str, str]:
+    """What to type next, and why."""
+    again = f"animatic label --out {root}"
+    for stage in stages:
+        if stage.retryable:
+            count = sum(stage.retryable.values())
+            return again, f"{count} of {stage.stage} failed for a reason that may pass"
+        if stage.items is None or stage.pending:
+            left = f"{stage.pending} of {stage.stage} are to be made" if stage.pending else stage.waits_for
+            return again, left
+    if stages[-1].done and (root / "shards" / "index.parquet").is_file():
+        return f"animatic inspect {root}", "everything is packed"
+    return again, "nothing is packed yet"
+
+
+def print_status(root: Path, *, as_json: bool = False) -> int:
+    """Print a job's status; 1 where something failed."""
+    status = job_status(root)
+    failed = any(stage.failed or stage.retryable for stage in status.stages)
+    console = make_console()
+    if as_json:
+        print(json.dumps(asdict(status), indent=1))
+        return int(failed)
+    table = Table(title=f"{root}: {status.videos} videos", title_justify="left", box=None, pad_edge=False)
+    table.add_column("stage", style="bold")
+    for column in ("items", "done", "to do"):
+        table.add_column(column, justify="right")
+    table.add_column("dropped")
+    table.add_column("failed")
+    for stage in status.stages:
+        if stage.items is None:
+            table.add_row(stage.stage, "?", "", "", "", "[dim]waits for an earlier stage[/]")
+            continue
+        lost = _words(stage.failed, "") + _words(stage.retryable, ", to be tried again")
+        table.add_row(
+            stage.stage, str(stage.items), str(stage.done), str(stage.pending or ""), "; ".join(_words(stage.dropped)),
+            f"[red]{escape('; '.join(lost))}[/]" if lost else "",
+        )  # fmt: skip
+    console.print(table)
+    if status.clips:
+        console.print("clips: " + ", ".join(f"{count} {name}" for name, count in status.clips.items()))
+    for line in failure_lines(root):
+        console.print(f"[red]{escape(line)}[/]")
+    console.print(f"next: [bold]{status.next_command}[/]  [dim]({escape(status.next_reason)})[/]")
+    return int(failed)
+
+
+def _words(counts: Mapping[str, int], ending: str = "") -> list[str]:
+    return [f"{count} {reason}{ending}" for reason, count in counts.items()]
+
+
+def failure_lines(root: Path, *, most: int = 20) -> list[str]:
+    """What failed and why, one line each."""
+    lines = [
+        f"{stage}: {receipt.item}: {receipt.message}"
+        for names in COMMAND_STAGES.values()
+        for stage in names
+        for receipt in read_receipts(root, stage).values()
+        if receipt.state == "failed"
+    ]
+    return lines[:most] + ([f"... and {len(lines) - most} more"] if len(lines) > most else [])
+
+
+def inspect(root: Path, key: str | None, *, sheet: Path | None = None, as_json: bool = False) -> int:
+    """The dataset's summary, or a clip's record and contact sheet.
+
+    Raises:
+        AnimaticError: no job, no such clip, a clip that was dropped, or a picture that cannot be written.
+    """
+    if key is None:
+        if sheet is not None:
+            raise ConfigError(f"--sheet shows one clip; name it, such as {_some_key(root)}")
+        summary = summarize(root)
+        print_json(asdict(summary)) if as_json else _print_summary(root, summary)
+        return 0
+    sample = _find_sample(root, key)
+    if sheet is not None:
+        write_contact_sheet(sample, sheet)
+    record = clip_record(sample)
+    if as_json:
+        print_json(record)
+    else:
+        _print_record(record)
+        if sheet is not None:
+            make_console().print(f"contact sheet: {sheet}")
+    return 0
+
+
+def _some_key(root: Path) -> str:
+    keys = [key for split in ("train", "val") for key in ShardDataset(root, split).keys]
+    return keys[0] if keys else "<video_id>_<start_frame>"
+
+
+def _find_sample(root: Path, key: str) -> Any:
+    for split in ("train", "val"):
+        dataset = ShardDataset(root, split)
+        if key in dataset.keys:
+            return dataset.sample(key)
+    if (root / SELECTION).is_file():
+        row = clip_verdict(root, key)
+        dropped = read_receipts(root, "render").get(key)
+        reason = row.reason or (dropped.reason or dropped.message if dropped else "it is not packed yet")
+        raise DataError(f"{key}: is not in the shards: {reason}; `animatic status {root}` says more")
+    raise DataError(f"{root}: has no clip {key!r}; `animatic inspect {root}` says what there is")
+
+
+def print_json(value: Any) -> None:
+    """Print JSON, a key to a line."""
+    print(json.dumps(value, indent=1))
+
+
+def _print_summary(root: Path, summary: Summary) -> None:
+    console = make_console()
+    table = Table(title=str(root), title_justify="left", show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column()
+    threshold = f"at least {summary.threshold:.3g} objects" if summary.threshold is not None else "every clip"
+    rows = {
+        "source": f"{summary.videos} videos, {summary.source_hours:.3g} h",
+        "clips": f"{summary.clips}, kept {summary.kept} ({threshold}), packed {sum(summary.packed.values())} "
+        f"({', '.join(f'{count} {split}' for split, count in summary.packed.items())}), {summary.clip_hours:.3g} h",
+        "dropped": ", ".join(f"{count} {reason}" for reason, count in summary.dropped.items()) or "none",
+        "objects per clip": _spread_text(summary.objects_per_clip, "counted"),
+        "tracks per clip": _spread_text(summary.tracks_per_clip, ""),
+        "path length": _spread_text(summary.path_length_m, "m"),
+        "bytes": ", ".join(f"{kind} {file_size(size)}" for kind, size in summary.bytes_by_kind.items()) or "none",
+        "failed": ", ".join(f"{count} in {stage}" for stage, count in summary.failed.items()) or "none",
+    }
+    for name, text in rows.items():
+        table.add_row(name, escape(text))
+    console.print(table)
+    if summary.packed:
+        console.print(f"one clip: [bold]animatic inspect {root} {_some_key(root)} --sheet sheet.png[/]")
+
+
+def _spread_text(found: Spread | None, unit: str) -> str:
+    if found is None:
+        return "not counted"
+    return f"{found.least:.3g} to {found.greatest:.3g}, median {found.median:.3g} {unit}".rstrip()
+
+
+def _print_record(record: Mapping[str, Any]) -> None:
+    table = Table(title=record["key"], title_justify="left", show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column()
+    for name, value in record.items():
+        if isinstance(value, Mapping):
+            value = ", ".join(f"{key} {_short(item)}" for key, item in value.items())
+        table.add_row(name, escape(str(_short(value))))
+    make_console().print(table)
+
+
+def _short(value: Any) -> Any:
+    return f"{value:.6g}" if isinstance(value, float) else value
