@@ -99,7 +99,7 @@ def test_simcc_gives_rtmlibs_keypoints_within_a_hundredth_of_a_pixel(real_data: 
         boxes = np.concatenate([corners, corners + rng.uniform(15, 300, (6, 2))], axis=1)
         boxes = boxes[boxes[:, 1] < 500]
         (points,) = head.estimate([frame], [boxes])
-        theirs, their_scores = peer(frame, boxes)
+        theirs, their_scores = peer(frame, list(boxes))
         present = points[..., 2] > 0
         assert np.abs(points[..., :2] - theirs)[present].max() < 1e-2
         # Ours is the lesser of two maxima, theirs the mean: never more, and absent wherever theirs is.
