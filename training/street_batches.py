@@ -22,6 +22,7 @@ LEAST_SHARE = 0.15
 """Objects of which less is visible are left out of the detector's loss: neither asked for nor forbidden."""
 _LEAST_WINDOW_PX = 5.0
 _HIDDEN_WEIGHT = 0.25
+_MEAN_COLOUR = tuple(float(round(value)) for value in IMAGENET_MEAN)
 _FOUND_WITHIN = 0.1
 """Of the box diagonal: what PCK@0.1 calls right."""
 
@@ -144,7 +145,8 @@ class CropBatches:
         places, seen = np.stack(points), np.stack(visible)
         inside = ((places >= 0) & (places < np.array(self.size))).all(axis=2)
         seen &= inside
-        along_x, along_y = encode_responses(places, self.size)
+        # A point behind the camera is nowhere; its weight is 0.
+        along_x, along_y = encode_responses(np.nan_to_num(places), self.size)
         weights = np.where(seen, 1.0, _HIDDEN_WEIGHT * inside).astype(np.float32)
         arrays = (along_x, along_y, weights, seen.astype(np.float32), np.array(tolerances, np.float32))
         return tuple(torch.from_numpy(array) for array in arrays)
@@ -173,7 +175,7 @@ class FieldBatches:
                 rng, source=(width, height), target=self.size, scales=self.scales, flip=flip, rotation_deg=2.0
             )
             disturbed = disturb(frame.half, rng, self.augment)
-            pictures.append(cv2.warpAffine(disturbed, half_to_input, self.size, flags=cv2.INTER_LINEAR))
+            pictures.append(cv2.warpAffine(disturbed, half_to_input, self.size, borderValue=_MEAN_COLOUR))
             targets.append(self._fields(frame.objects, half_to_input, flip))
         stacked = [tensor for votes in zip(*targets, strict=True) for tensor in _stack_votes(votes)]
         return Batch(pictures=to_input(pictures, "imagenet"), targets=tuple(stacked))
@@ -205,7 +207,8 @@ def field_object(
 
     A lane goes on behind a car: its hidden points are asked for. A car's are not.
     """
-    points = map_points(truth.points_xy / 2, half_to_input)
+    # Pixel centres lie on integers in both pictures.
+    points = map_points(truth.points_xy / 2 - 0.25, half_to_input)
     there = truth.visible
     if table.category == "lane":
         steps = np.hypot(*np.diff(points, axis=0).T)

@@ -37,7 +37,7 @@ class ResidualUnit(nn.Module):
 
 
 class Trunk(nn.Module):
-    """A stem at stride 4, then stages at strides 8, 16, ...; each halves the picture and refines it with residual units.
+    """A stem at stride 4, then stages at strides 8, 16, ...: each halves the picture, then refines it.
 
     The stem is one large convolution: at stride 2, moving memory costs more than the products. Cell i of any stage is
     centred on input pixel i * stride.

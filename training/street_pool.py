@@ -18,7 +18,7 @@ CROP_LIMIT_PX = 360
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StreetPlan:
+class RenderPlan:
     """Which frames of which street are rendered."""
 
     config: StreetConfig
@@ -33,7 +33,7 @@ class ObjectTruth:
     box_xyxy: np.ndarray
     """(4,) float32: of what is visible in the picture."""
     points_xy: np.ndarray
-    """(K, 2) float32."""
+    """(K, 2) float32; NaN behind the camera."""
     visible: np.ndarray
     """(K,) bool."""
     visible_share: float
@@ -82,7 +82,7 @@ def truths_of(frame: StreetFrame) -> tuple[ObjectTruth, ...]:
 
 
 def render_pool(
-    plans: Sequence[StreetPlan], *, least_crop_px: float = 20.0, least_share: float = 0.2, workers: int = 2
+    plans: Sequence[RenderPlan], *, least_crop_px: float = 20.0, least_share: float = 0.2, workers: int = 2
 ) -> StreetPool:
     """Render all planned frames, streets in parallel, results in the order of the plans.
 
@@ -105,7 +105,7 @@ def render_pool(
 
 
 def _render_street(
-    plan: StreetPlan, least_crop_px: float, least_share: float
+    plan: RenderPlan, least_crop_px: float, least_share: float
 ) -> tuple[list[PoolFrame], list[PoolCrop]]:
     cv2.setNumThreads(1)
     street = Street(plan.config)
