@@ -13,7 +13,7 @@ import numpy as np
 
 from labeling.camera import Intrinsics, Trajectory
 from labeling.ego_dust import SPECK_COLOUR, Specks, fill_cube, specks_in_view
-from labeling.ego_sphere import SPHERE_RADIUS_M, CheckRaster
+from labeling.ego_sphere import SPHERE_RADIUS_M, CheckRaster, world_raster
 from labeling.errors import ConfigError
 
 PACKAGE = "libosmesa6"
@@ -70,13 +70,11 @@ def reference_frames(trajectory: Trajectory, *, intrinsics: Intrinsics, seed: in
 def _frames(trajectory: Trajectory, camera: Intrinsics, seed: int) -> Iterator[np.ndarray]:
     import pyvista  # ends the process where there is no OpenGL, so never at import
 
-    from labeling.ego_video import world_raster
-
     cube = fill_cube(camera, seed=seed)
-    plotter = pyvista.Plotter(off_screen=True, window_size=(camera.width, camera.height), lighting="none")
+    plotter = pyvista.Plotter(off_screen=True, window_size=[camera.width, camera.height], lighting="none")
     try:
         plotter.enable_anti_aliasing("msaa", multi_samples=_SAMPLES)
-        plotter.set_background("black")
+        plotter.background_color = "black"
         plotter.add_mesh(_sphere_mesh(), texture=_texture(world_raster(camera)), lighting=False)
         _set_lens(plotter.camera, camera)
         for motion in trajectory.cam_to_world:

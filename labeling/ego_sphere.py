@@ -16,11 +16,14 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from labeling.camera import Intrinsics
 from labeling.errors import TrajectoryError
 
 SPHERE_RADIUS_M = 500.0
 CHECKS_AROUND, CHECKS_DOWN = 64, 32
 
+_PALETTE_SEED = 42
+_EDGE_PIXELS = 1.5
 _STEP = 8
 # Linear interpolation over 8 pixels is off by 0.1 pixel where a block spans this much azimuth; elsewhere by less.
 _LARGEST_TURN = 0.1 / (2 * math.pi)
@@ -58,6 +61,18 @@ def checkered(colours: np.ndarray) -> np.ndarray:
     """``colours`` (n, m, 3) uint8 with the cells whose indices have an even sum made black."""
     i, j = np.indices(colours.shape[:2])
     return np.where(((i + j) % 2 == 0)[..., None], 0, colours).astype(np.uint8)
+
+
+def world_raster(intrinsics: Intrinsics) -> CheckRaster:
+    """Checks whose texels are about 1.5 pixels wide, so that their edges look antialiased in any picture size."""
+    colours = np.random.default_rng(_PALETTE_SEED).integers(0, 256, (CHECKS_AROUND, CHECKS_DOWN, 3), np.uint8)
+    focal = math.sqrt(intrinsics.fx * intrinsics.fy)
+    texels = max(4, round(focal * 2 * math.pi / CHECKS_AROUND / _EDGE_PIXELS))
+    columns, rows = np.repeat(np.arange(CHECKS_AROUND), texels), np.repeat(np.arange(CHECKS_DOWN), texels)
+    return CheckRaster(
+        columns=np.pad(columns, 1, mode="wrap"), rows=np.pad(rows, 1, mode="edge"), palette=checkered(colours),
+        rounding=0.5,
+    )  # fmt: skip
 
 
 def draw_sphere(cam_to_world: np.ndarray, *, raster: CheckRaster, lens: Lens, width: int, height: int) -> np.ndarray:

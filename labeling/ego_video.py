@@ -5,7 +5,6 @@ and dust in it (``labeling.ego_dust`` states its near plane and its sizes). Styl
 renderer's look, for its adapters only. ``labeling.ego_reference`` draws the ``world`` scene with VTK instead.
 """
 
-import math
 import warnings
 from collections.abc import Iterator
 from typing import Literal
@@ -15,14 +14,11 @@ import numpy as np
 from labeling.camera import Intrinsics, Trajectory, prior_intrinsics
 from labeling.ego_dust import draw_specks, fill_cube, specks_in_view
 from labeling.ego_released import released_frames
-from labeling.ego_sphere import CHECKS_AROUND, CHECKS_DOWN, CheckRaster, Lens, checkered, draw_sphere
+from labeling.ego_sphere import Lens, draw_sphere, world_raster
 from labeling.errors import ConfigError
 
 EgoStyle = Literal["world", "released"]
 EgoRenderer = Literal["remap", "pyvista"]
-
-_PALETTE_SEED = 42
-_EDGE_PIXELS = 1.5
 
 
 def ego_frames(
@@ -64,18 +60,6 @@ def ego_frames(
             return ego_reference.reference_frames(trajectory, intrinsics=camera, seed=seed)
         warnings.warn(missing, RuntimeWarning, stacklevel=2)
     return _world_frames(trajectory, camera, seed)
-
-
-def world_raster(intrinsics: Intrinsics) -> CheckRaster:
-    """Checks whose texels are about 1.5 pixels wide, so that their edges look antialiased in any picture size."""
-    colours = np.random.default_rng(_PALETTE_SEED).integers(0, 256, (CHECKS_AROUND, CHECKS_DOWN, 3), np.uint8)
-    focal = math.sqrt(intrinsics.fx * intrinsics.fy)
-    texels = max(4, round(focal * 2 * math.pi / CHECKS_AROUND / _EDGE_PIXELS))
-    columns, rows = np.repeat(np.arange(CHECKS_AROUND), texels), np.repeat(np.arange(CHECKS_DOWN), texels)
-    return CheckRaster(
-        columns=np.pad(columns, 1, mode="wrap"), rows=np.pad(rows, 1, mode="edge"), palette=checkered(colours),
-        rounding=0.5,
-    )  # fmt: skip
 
 
 def _world_frames(trajectory: Trajectory, camera: Intrinsics, seed: int) -> Iterator[np.ndarray]:

@@ -124,7 +124,7 @@ def skeleton_capsules(
     if min(width, height, label_width, label_height) <= 0:
         raise ConfigError(f"cannot draw {label_width}x{label_height} labels on {width}x{height}; sizes are positive")
     scale_x, scale_y = width / label_width, height / label_height
-    size = math.sqrt(width * height / (_STYLE_WIDTH * _STYLE_HEIGHT))
+    size = _size(width, height)
     parts = []
     for group in _groups(labels):
         points = np.array([one.points for one in group], np.float64)
@@ -164,6 +164,12 @@ def dot_edges(schema: str) -> np.ndarray:
     for edge, point in owner.items():
         chosen[point] = edge
     return chosen
+
+
+def style_radii(line: float, dot: float, *, width: int, height: int) -> tuple[float, float]:
+    """Radii in pixels of a picture, of a line and a dot that a style gives as thicknesses at 768x512."""
+    size = _size(width, height)
+    return _line_radius(line * size), _dot_radius(dot * size)
 
 
 def complete_lane(points: np.ndarray, *, count: int = _LANE_POINTS) -> np.ndarray:
@@ -329,6 +335,10 @@ def _rainbow(hues_deg: Sequence[float]) -> np.ndarray:
     """(N, 3) uint8 RGB of full saturation and value."""
     colours = [colorsys.hsv_to_rgb((hue % 360) / 360, 1.0, 1.0) for hue in hues_deg]
     return np.rint(255 * np.array(colours)).astype(np.uint8)
+
+
+def _size(width: int, height: int) -> float:
+    return math.sqrt(width * height / (_STYLE_WIDTH * _STYLE_HEIGHT))
 
 
 def _line_radius(width: float) -> float:
