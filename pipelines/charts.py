@@ -1,0 +1,185 @@
+"""Speed against accuracy: the methods of a stage measured side by side, as JSON and as a picture.
+
+A chart's module (one a stage, see ``CHARTS``) says what is measured and returns a ``Chart``; here it is written and drawn
+with its Pareto front. Methods are timed interleaved, since machines are shared: whatever slows one slows all.
+"""
+
+import importlib
+import json
+import platform
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from labeling.errors import ConfigError
+
+CHARTS: dict[str, str] = {
+    "count": "pipelines.charts_count",
+    "detect": "pipelines.charts_keypoints",
+    "keypoints": "pipelines.charts_keypoints",
+    "track": "pipelines.charts_keypoints",
+    "ego": "pipelines.charts_ego",
+    "ego-video": "pipelines.charts_ego_video",
+    "train": "pipelines.charts_train",
+    "generate": "pipelines.charts_train",
+}
+"""The module of each chart; it has ``chart(name, *, quick) -> Chart``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cost:
+    """Milliseconds per frame over interleaved runs."""
+
+    median: float
+    p95: float
+    runs: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Error:
+    """How far from the truth, in the metric and unit that every point of a chart shares."""
+
+    metric: str
+    unit: str
+    median: float
+    p95: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChartPoint:
+    """One method at one setting."""
+
+    method: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    ms_per_frame: Cost
+    error: Error
+    reference: bool = False
+    """The best that can be run at all, or the trivial method: drawn apart."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chart:
+    """What was measured, on what, where."""
+
+    stage: str
+    data: str
+    points: tuple[ChartPoint, ...]
+    machine: str
+    threads: int = 1
+
+
+def machine_name() -> str:
+    """The processor, its cores, and the system: what a figure was measured on."""
+    model = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else model}, {max(1, len(names))} cores, {platform.system()}"
+
+
+def interleaved_ms(methods: Sequence[Callable[[], int]], *, runs: int) -> list[Cost]:
+    """Cost of each method; a method runs once and returns how many frames it did.
+
+    The methods take turns, ``runs`` times, and processor time of this thread is counted, so that what else runs on the
+    machine weighs on all of them alike, and little.
+    """
+    samples: list[list[float]] = [[] for _ in methods]
+    for _ in range(runs):
+        for method, taken in zip(methods, samples, strict=True):
+            start = time.process_time()
+            frames = method()
+            taken.append((time.process_time() - start) * 1000 / max(1, frames))
+    return [Cost(median=float(np.median(taken)), p95=float(np.percentile(taken, 95)), runs=runs) for taken in samples]
+
+
+def pareto_front(points: Sequence[ChartPoint]) -> list[ChartPoint]:
+    """The points that no other beats in both cost and error, cheapest first."""
+    front: list[ChartPoint] = []
+    for point in sorted(points, key=lambda point: (point.ms_per_frame.median, point.error.median)):
+        if not front or point.error.median < front[-1].error.median:
+            front.append(point)
+    return front
+
+
+def run_chart(name: str, *, out: Path, quick: bool = False) -> Chart:
+    """Measure the chart called ``name`` and write ``chart-<name>.json`` and ``.png`` into ``out``.
+
+    Raises:
+        ConfigError: no chart has that name.
+    """
+    if name not in CHARTS:
+        raise ConfigError(f"no chart is called {name!r}; choose one of {', '.join(CHARTS)}")
+    chart: Chart = importlib.import_module(CHARTS[name]).chart(name, quick=quick)
+    write_chart(chart, out)
+    return chart
+
+
+def write_chart(chart: Chart, out: Path) -> None:
+    """``chart-<stage>.json`` and ``chart-<stage>.png`` in the folder ``out``."""
+    out.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(asdict(chart), indent=1, ensure_ascii=False) + "\n"
+    (out / f"chart-{chart.stage}.json").write_text(text, encoding="utf-8")
+    draw_chart(chart, out / f"chart-{chart.stage}.png")
+
+
+def draw_chart(chart: Chart, path: Path) -> None:
+    """The picture: cost on a log axis, error upwards, the front as a line, every point named."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 6.4), dpi=120, layout="constrained")
+    axes = figure.add_subplot()
+    front = pareto_front(chart.points)
+    axes.step(
+        [point.ms_per_frame.median for point in front], [point.error.median for point in front], where="post",
+        color="#2b6cb0", alpha=0.5, linewidth=1.5, zorder=1,
+    )  # fmt: skip
+    for point in chart.points:
+        colour = "#c05621" if point.reference else "#2b6cb0" if point in front else "#718096"
+        axes.scatter(
+            point.ms_per_frame.median, point.error.median, s=46, color=colour, zorder=3,
+            marker="D" if point.reference else "o",
+        )  # fmt: skip
+    axes.set_xscale("log")
+    errors = [point.error.median for point in chart.points if point.error.median > 0]
+    if len(errors) > 1 and max(errors) > 30 * min(errors) and len(errors) == len(chart.points):
+        axes.set_yscale("log")
+    axes.margins(x=0.18, y=0.12)
+    _name_points(axes, chart.points)
+    unit = chart.points[0].error
+    axes.set_xlabel("cost, ms per frame (median, log)")
+    axes.set_ylabel(f"{unit.metric}, {unit.unit} (median)")
+    axes.set_title(f"{chart.stage}: {chart.data}\n", fontsize=11, loc="left")
+    axes.text(
+        0, 1.012, f"{chart.machine}; {chart.threads} thread{'s' if chart.threads > 1 else ''}; diamonds: references; "
+        "line: Pareto front", transform=axes.transAxes, fontsize=8, color="#4a5568",
+    )  # fmt: skip
+    axes.grid(True, which="both", alpha=0.2)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path)
+
+
+def _name_points(axes: Any, points: Sequence[ChartPoint]) -> None:
+    """Names beside the points, moved up or down until they are clear of each other."""
+    axes.figure.canvas.draw()
+    taken: list[tuple[float, float, float]] = []
+    for point in sorted(points, key=lambda point: -point.error.median):
+        x, y = axes.transData.transform((point.ms_per_frame.median, point.error.median))
+        width = 8.4 * len(point.method)
+        offset = min(
+            (step for step in (0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75)),
+            key=lambda step: (
+                any(abs(y + step - ty) < 14 and x + width > tx and x < tx + tw for tx, ty, tw in taken), abs(step)
+            ),
+        )  # fmt: skip
+        taken.append((x, y + offset, width))
+        axes.annotate(
+            point.method, (point.ms_per_frame.median, point.error.median), xytext=(7, offset * 0.6),
+            textcoords="offset points", fontsize=8.5, va="center", color="#1a202c", zorder=4,
+            arrowprops={"arrowstyle": "-", "color": "#a0aec0", "lw": 0.5} if offset else None,
+        )  # fmt: skip

@@ -1,0 +1,88 @@
+"""Where methods fail: named scenarios, a figure and a bound for each, held or not, never left out."""
+
+import importlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from labeling.errors import ConfigError
+from pipelines.charts import machine_name
+
+STABILITY: dict[str, str] = {
+    "ego": "pipelines.stability_ego",
+    "keypoints": "pipelines.stability_keypoints",
+}
+"""The module of each table; it has ``stability(*, quick) -> StabilityTable``."""
+
+Verdict = Literal["held", "not held", "reported"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StabilityRow:
+    """One scenario played against one method."""
+
+    scenario: str
+    method: str
+    figure: float | None
+    """What was measured; None where the method gave no answer and said so."""
+    unit: str
+    bound: str
+    """As a person reads it, such as ``<= 0.1``."""
+    verdict: Verdict
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StabilityTable:
+    """All scenarios of a stage."""
+
+    stage: str
+    data: str
+    machine: str
+    rows: tuple[StabilityRow, ...]
+
+
+def judged(
+    scenario: str, figure: float, *, unit: str, at_most: float | None = None, at_least: float | None = None,
+    method: str = "default", note: str = "",
+) -> StabilityRow:  # fmt: skip
+    """A row with its verdict; without a bound the figure is reported only."""
+    if at_most is not None:
+        bound, held = f"<= {at_most:g}", figure <= at_most
+    elif at_least is not None:
+        bound, held = f">= {at_least:g}", figure >= at_least
+    else:
+        return StabilityRow(
+            scenario=scenario, method=method, figure=figure, unit=unit, bound="", verdict="reported", note=note
+        )
+    return StabilityRow(
+        scenario=scenario, method=method, figure=figure, unit=unit, bound=bound,
+        verdict="held" if held else "not held", note=note,
+    )  # fmt: skip
+
+
+def run_stability(name: str, *, out: Path, quick: bool = False) -> StabilityTable:
+    """Play the scenarios of the stage called ``name`` and write ``stability-<name>.json`` into ``out``.
+
+    Raises:
+        ConfigError: no table has that name.
+    """
+    if name not in STABILITY:
+        raise ConfigError(f"no stability table is called {name!r}; choose one of {', '.join(STABILITY)}")
+    table: StabilityTable = importlib.import_module(STABILITY[name]).stability(quick=quick)
+    write_stability(table, out)
+    return table
+
+
+def write_stability(table: StabilityTable, out: Path) -> None:
+    """``stability-<stage>.json`` in the folder ``out``."""
+    out.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(asdict(table), indent=1, ensure_ascii=False) + "\n"
+    (out / f"stability-{table.stage}.json").write_text(text, encoding="utf-8")
+
+
+def make_table(stage: str, data: str, rows: Sequence[StabilityRow]) -> StabilityTable:
+    """A table measured on this machine."""
+    return StabilityTable(stage=stage, data=data, machine=machine_name(), rows=tuple(rows))

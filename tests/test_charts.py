@@ -1,0 +1,73 @@
+"""Charts and stability tables: the front, the files, the picture."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+from labeling.errors import ConfigError
+from pipelines.charts import Chart, ChartPoint, Cost, Error, interleaved_ms, pareto_front, run_chart, write_chart
+from pipelines.stability import judged, make_table, run_stability, write_stability
+
+
+def point(method: str, ms: float, error: float, *, reference: bool = False) -> ChartPoint:
+    return ChartPoint(
+        method=method, ms_per_frame=Cost(median=ms, p95=ms, runs=3), reference=reference,
+        error=Error(metric="end error", unit="m", median=error, p95=error),
+    )  # fmt: skip
+
+
+POINTS = (
+    point("trivial", 0.1, 9.0, reference=True),
+    point("fast", 1, 3.0),
+    point("slower and worse", 2, 4.0),
+    point("balanced", 4, 1.0),
+    point("exact", 20, 0.5, reference=True),
+)
+
+
+def test_front_holds_what_nothing_beats() -> None:
+    assert [p.method for p in pareto_front(POINTS)] == ["trivial", "fast", "balanced", "exact"]
+
+
+def test_chart_files(tmp_path: Path) -> None:
+    chart = Chart(stage="ego", data="a street", points=POINTS, machine="a machine")
+    write_chart(chart, tmp_path)
+    stored = json.loads((tmp_path / "chart-ego.json").read_text())
+    assert [p["method"] for p in stored["points"]] == [p.method for p in POINTS]
+    picture = cv2.imread(str(tmp_path / "chart-ego.png"))
+    assert picture is not None and picture.shape[1] == 1200
+
+
+def test_methods_take_turns() -> None:
+    order: list[str] = []
+
+    def method(name: str):
+        return lambda: order.append(name) or 10
+
+    costs = interleaved_ms([method("a"), method("b")], runs=3)
+    assert order == ["a", "b"] * 3
+    assert [cost.runs for cost in costs] == [3, 3]
+
+
+@pytest.mark.parametrize(
+    ("limits", "verdict"),
+    [({"at_most": 1.0}, "not held"), ({"at_least": 1.0}, "held"), ({}, "reported")],
+    ids=["above", "enough", "no bound"],
+)
+def test_verdicts(limits: dict[str, Any], verdict: str) -> None:
+    assert judged("night", 2.0, unit="degrees", **limits).verdict == verdict
+
+
+def test_tables_are_written(tmp_path: Path) -> None:
+    write_stability(make_table("ego", "a street", [judged("night", 2.0, unit="m", at_most=3)]), tmp_path)
+    assert json.loads((tmp_path / "stability-ego.json").read_text())["rows"][0]["verdict"] == "held"
+
+
+def test_unknown_names_list_the_known(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="ego-video"):
+        run_chart("ergo", out=tmp_path)
+    with pytest.raises(ConfigError, match="keypoints"):
+        run_stability("ergo", out=tmp_path)
