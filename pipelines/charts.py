@@ -1,7 +1,7 @@
 """Speed against accuracy: the methods of a stage measured side by side, as JSON and as a picture.
 
-A chart's module (one a stage, see ``CHARTS``) says what is measured and returns a ``Chart``; here it is written and drawn
-with its Pareto front. Methods are timed interleaved, since machines are shared: whatever slows one slows all.
+A chart's module (one a stage, see ``CHARTS``) says what is measured and returns a ``Chart``; here it is written and
+drawn with its Pareto front. Methods are timed interleaved, since machines are shared: whatever slows one slows all.
 """
 
 import importlib
@@ -172,7 +172,7 @@ def _name_points(axes: Any, points: Sequence[ChartPoint]) -> None:
         x, y = axes.transData.transform((point.ms_per_frame.median, point.error.median))
         width = 8.4 * len(point.method)
         offset = min(
-            (step for step in (0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75)),
+            (step for step in (15, -15, 30, -30, 45, -45, 60, -60, 75, -75)),
             key=lambda step: (
                 any(abs(y + step - ty) < 14 and x + width > tx and x < tx + tw for tx, ty, tw in taken), abs(step)
             ),
@@ -181,5 +181,6 @@ def _name_points(axes: Any, points: Sequence[ChartPoint]) -> None:
         axes.annotate(
             point.method, (point.ms_per_frame.median, point.error.median), xytext=(7, offset * 0.6),
             textcoords="offset points", fontsize=8.5, va="center", color="#1a202c", zorder=4,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
             arrowprops={"arrowstyle": "-", "color": "#a0aec0", "lw": 0.5} if offset else None,
         )  # fmt: skip
