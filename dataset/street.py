@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dataset.street_actors import Actor, car_actor_now, ground_shadow, person_actor_now
+from dataset.street_actors import Actor, car_actor_now, ground_shadows, person_actor_now
 from dataset.street_drives import Drive, StreetPath, drive_along, drive_given, path_from_bends, speed_profile, wandering
 from dataset.street_labels import StreetObject, label_actors, label_lanes
 from dataset.street_raster import Canvas, Polygons, blank_canvas, join, make_polygons, paint
@@ -30,6 +30,7 @@ SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)
 _HAZE_M = 420.0
 _FAR_M = 260.0
 _SHADOW_M = 90.0
+_ACTORS_M = 130.0
 _SKY_M = 2.0e4
 
 
@@ -165,15 +166,16 @@ class Street:
 
     def _actors(self, i: int, cam_to_street: np.ndarray) -> list[Actor]:
         """Who is near and not wholly behind, from far to near."""
-        eye, ahead = cam_to_street[:3, 3], cam_to_street[:3, 2]
+        eye = cam_to_street[:3, 3]
         found: list[tuple[float, Actor]] = []
-        makers = [(self._cars, car_actor_now), (self._people, person_actor_now)]
-        for actors, make in makers:
-            for actor in actors:
-                offset = actor.position[i] - eye
-                distance = float(np.linalg.norm(offset))
-                if distance < 130.0 and offset @ ahead > -3.0:  # False for NaN: not there now.
-                    found.append((distance, make(actor, i, eye=eye, sun=self._sun)))
+        for actors, make, radius in ((self._cars, car_actor_now, 3.0), (self._people, person_actor_now, 1.5)):
+            if not actors:
+                continue
+            middle = np.array([actor.position[i] for actor in actors]) - (0.0, 0.9, 0.0)
+            seen = self._in_view(middle, np.full(len(middle), radius), cam_to_street)  # False for NaN: not there now.
+            for index in np.flatnonzero(seen & (np.linalg.norm(middle - eye, axis=1) < _ACTORS_M)):
+                actor = make(actors[index], i, eye=eye, sun=self._sun)
+                found.append((actor.distance_m, actor))
         found.sort(key=lambda pair: -pair[0])
         return [actor.with_owner(order + 1) for order, (_, actor) in enumerate(found[-250:])]
 
@@ -200,8 +202,8 @@ class Street:
         for _, kind, index in sorted(order):
             thing = actors[index].polygons if kind else world.things[index]
             standing.append(thing if kind else thing.take(np.flatnonzero(facing(thing, eye))))
-        shadows = [ground_shadow(actor, self._sun) for actor in actors if actor.distance_m < _SHADOW_M]
-        return join([self._sky_at(eye), world.ground.take(np.flatnonzero(near)), *shadows, *standing])
+        shadows = ground_shadows([actor for actor in actors if actor.distance_m < _SHADOW_M], self._sun)
+        return join([self._sky_at(eye), world.ground.take(np.flatnonzero(near)), shadows, *standing])
 
     def _in_view(self, middle: np.ndarray, radius: np.ndarray, cam_to_street: np.ndarray) -> np.ndarray:
         """(G,) bool: balls that may reach into the picture."""

@@ -8,7 +8,7 @@ from dataset.street_cars import CarModel, car_model
 from dataset.street_cars import hidden_by_itself as hidden_on_car
 from dataset.street_people import hidden_by_itself as hidden_on_person
 from dataset.street_people import joints_at, person_polygons
-from dataset.street_raster import Polygons, join, make_polygons
+from dataset.street_raster import Polygons
 from dataset.street_traffic import CarActor, PersonActor
 from labeling.camera import invert, rigid
 from labeling.schemas import Category
@@ -90,7 +90,7 @@ def _car_polygons(
         corners=corners.astype(np.float32), corner_count=model.corner_count[index], colour=lit.astype(np.float32),
         texture=np.full(count, -1, np.int32), gradient=np.zeros((count, 2, 4), np.float32),
         owner=np.zeros(count, np.int32), alpha=np.ones(count, np.float32),
-        grow_px=np.where(model.solid[index], 0.5, 0.0).astype(np.float32), fog=np.ones(count, np.float32),
+        grow_px=np.where(model.solid[index], 0.5, 0.3).astype(np.float32), fog=np.ones(count, np.float32),
     )  # fmt: skip
 
 
@@ -108,16 +108,23 @@ def person_actor_now(person: PersonActor, i: int, *, eye: np.ndarray, sun: np.nd
     )  # fmt: skip
 
 
-def ground_shadow(actor: Actor, sun: np.ndarray) -> Polygons:
-    """A soft dark patch under an actor, a little away from the sun."""
+def ground_shadows(actors: list[Actor], sun: np.ndarray) -> Polygons:
+    """Soft dark patches under actors, a little away from the sun: three rings each."""
     angle = np.arange(12) * 2 * np.pi / 12
-    square = 4.0 if actor.category == "car" else 1.0
-    radius = (np.abs(np.cos(angle)) ** (2 * square) + np.abs(np.sin(angle)) ** (2 * square)) ** (-0.5 / square)
-    ring = np.stack([np.cos(angle) * radius, np.sin(angle) * radius, np.zeros(12)], -1)
+    power = np.array([4.0 if actor.category == "car" else 1.0 for actor in actors])[:, None]
+    radius = (np.abs(np.cos(angle)) ** (2 * power) + np.abs(np.sin(angle)) ** (2 * power)) ** (-0.5 / power)
+    ring = np.stack([np.cos(angle) * radius, np.sin(angle) * radius, np.zeros_like(radius)], -1)
+    footprint = np.array([[*actor.footprint, 0.0] for actor in actors]).reshape(-1, 3)
+    placed = np.array([actor.own_to_street for actor in actors]).reshape(-1, 4, 4)
     shift = np.array([-sun[0], 0.0, -sun[2]]) * 0.18
-    rows = []
-    for grow, alpha in ((0.22, 0.22), (0.06, 0.34), (-0.12, 0.4)):
-        size = np.maximum(actor.footprint + grow, 0.05)
-        corners = (ring * (size[0], size[1], 0)) @ actor.own_to_street[:3, :3].T + actor.own_to_street[:3, 3] + shift
-        rows.append(make_polygons([corners], colour=(18.0, 19.0, 22.0), alpha=alpha, grow_px=0.0))
-    return join(rows)
+    sizes = np.maximum(footprint[:, None] + np.array([0.22, 0.06, -0.12])[:, None], 0.05)
+    own = ring[:, None] * sizes[:, :, None]
+    corners = np.einsum("aij,arkj->arki", placed[:, :3, :3], own) + placed[:, None, None, :3, 3] + shift
+    count = 3 * len(actors)
+    return Polygons(
+        corners=corners.reshape(count, 12, 3).astype(np.float32), corner_count=np.full(count, 12, np.int32),
+        colour=np.full((count, 3), 20.0, np.float32), texture=np.full(count, -1, np.int32),
+        gradient=np.zeros((count, 2, 4), np.float32), owner=np.zeros(count, np.int32),
+        alpha=np.tile(np.array([0.22, 0.34, 0.4], np.float32), len(actors)), grow_px=np.zeros(count, np.float32),
+        fog=np.zeros(count, np.float32),
+    )  # fmt: skip

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import cv2
+import numba
 import numpy as np
 
 from dataset.street_actors import Actor
@@ -122,10 +123,27 @@ def _outline_area(
     if inside and not rejected:
         return drawn
     scale = _SILHOUETTE_PX / max(float((high - low).max()), 1.0)
-    mask = np.zeros((_SILHOUETTE_PX + 3, _SILHOUETTE_PX + 3), np.uint8)
-    for face, count in zip(pixels[ahead], polygons.corner_count[ahead], strict=True):
-        cv2.fillConvexPoly(mask, np.round(((face[:count] - low) * scale + 1) * 16).astype(np.int32), 1, shift=4)
-    return float(np.count_nonzero(mask)) / scale**2
+    small = np.ascontiguousarray((pixels[ahead] - low) * scale)
+    return _union_area(small, polygons.corner_count[ahead], _SILHOUETTE_PX + 1) / scale**2
+
+
+@numba.njit(cache=True)
+def _union_area(corners, counts, size):
+    """Pixels of a square picture whose centre lies in any of the convex polygons (N, K, 2)."""
+    mask = np.zeros((size, size), np.uint8)
+    for n in range(len(counts)):
+        for y in range(size):
+            low, high = 1e9, -1e9
+            for k in range(counts[n]):
+                ax, ay = corners[n, k, 0], corners[n, k, 1]
+                m = (k + 1) % counts[n]
+                bx, by = corners[n, m, 0], corners[n, m, 1]
+                if (ay <= y) != (by <= y):
+                    x = ax + (y - ay) / (by - ay) * (bx - ax)
+                    low, high = min(low, x), max(high, x)
+            for x in range(max(0, int(np.ceil(low))), min(size - 1, int(np.floor(high))) + 1):
+                mask[y, x] = 1
+    return mask.sum()
 
 
 def label_lanes(

@@ -3,8 +3,8 @@
 Every polygon is planar and convex, lies in 3-D, and is either flat-coloured or carries a texture with an affine map.
 For a pixel with ray ``d = ((x-cx)/fx, (y-cy)/fy, 1)`` and a plane ``n.X = c`` the inverse depth is ``n.d / c``, affine
 in the pixel, and a texture coordinate is ``(g.d) / inverse_depth + g0`` (perspective-correct). Edges blend by the
-distance of the pixel's centre to the edge. Textures are read trilinearly from a mip chain (Williams 1983) with up to
-``_MAX_TAPS`` taps along the longer axis of the pixel's footprint (Heckbert 1989).
+distance of the pixel's centre to the edge. Textures are read trilinearly from a mip chain (Williams 1983) with several
+taps along the longer axis of the pixel's footprint (Heckbert 1989).
 """
 
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ NO_OWNER = 0
 NO_TEXTURE = -1
 
 _NEAR_M = 0.12
-_MAX_TAPS = 3
 _SEGMENT = 8
 # A surface this much farther (relative) than what is painted still wins: decals lie on their host, painted after it.
 _DEPTH_SLACK = 0.985
+_FAST = {"nnan", "ninf", "nsz", "arcp", "contract"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -95,7 +95,9 @@ class Atlas:
     """Mip chains of all textures in one array; sides are powers of two, so that coordinates wrap by masks."""
 
     texels: np.ndarray
-    """(M, 3) uint8, RGB."""
+    """(M,) int64: red, green and blue in lanes of 21 bits, see ``pack_rgb``."""
+    taps: np.ndarray
+    """(T,) int32: samples along the longer axis of a pixel's footprint, at most."""
     offset: np.ndarray
     """(T, LEVELS) int64: where a level starts."""
     log_width: np.ndarray
@@ -104,6 +106,12 @@ class Atlas:
     """(T, LEVELS) int32."""
     levels: np.ndarray
     """(T,) int32: how many levels a texture has."""
+
+
+def pack_rgb(rgb: np.ndarray) -> np.ndarray:
+    """(..., 3) uint8 to (...) int64 with a lane of 21 bits for each colour."""
+    wide = rgb.astype(np.int64)
+    return wide[..., 0] | wide[..., 1] << 21 | wide[..., 2] << 42
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,7 +129,8 @@ class Canvas:
 def blank_canvas(width: int, height: int, colour: tuple[float, float, float]) -> Canvas:
     """A canvas of one colour, infinitely far."""
     rgb = np.empty((height, width, 3), np.uint8)
-    rgb[:] = np.asarray(colour, np.uint8)
+    rgb[0] = np.asarray(colour, np.uint8)
+    rgb[1:] = rgb[0]
     return Canvas(
         rgb=rgb, inverse_depth=np.zeros((height, width), np.float32), owner=np.zeros((height, width), np.uint8)
     )
@@ -149,41 +158,43 @@ def paint(
     """
     drawn, rejected = np.zeros(256, np.int64), np.zeros(256, np.int64)
     first, last = rows or (0, canvas.inverse_depth.shape[0])
+    shading = (
+        polygons.colour, polygons.texture, polygons.fog, atlas.texels, atlas.offset, atlas.log_width, atlas.log_height,
+        atlas.levels, atlas.taps, np.array(haze, np.float32), np.float32(haze_m),
+    )  # fmt: skip
     _paint(
-        canvas.rgb, canvas.inverse_depth, canvas.owner, drawn, rejected, first, last,
-        polygons.corners, polygons.corner_count, polygons.colour, polygons.texture, polygons.gradient,
-        polygons.owner, polygons.alpha, polygons.grow_px, polygons.fog,
+        canvas.rgb, canvas.inverse_depth, canvas.owner, drawn, rejected, first, last, polygons.corners,
+        polygons.corner_count, polygons.gradient, shading, polygons.owner, polygons.alpha, polygons.grow_px,
         world_to_cam.astype(np.float64), np.array(camera, np.float64),
-        atlas.texels, atlas.offset, atlas.log_width, atlas.log_height, atlas.levels,
-        np.array(haze, np.float32), np.float32(haze_m),
     )  # fmt: skip
     return drawn, rejected
 
 
 @numba.njit(cache=True, inline="always")
-def _texel(texels, start, log_width, mask_u, mask_v, u, v, weight, out):
-    """Add ``weight`` times the bilinear sample at (u, v) of one level to ``out``."""
+def _texel(texels, start, log_width, mask_u, mask_v, u, v, weight):
+    """``weight`` (0 to 4096) times the bilinear sample at (u, v) of one level, three sums in one integer.
+
+    A texel packs red, green and blue into lanes of 21 bits: eight of colour under twelve of weight leave one spare, so
+    one multiplication weighs all three and the lanes never touch.
+    """
     fu = u - np.float32(0.5)
     fv = v - np.float32(0.5)
     floor_u = np.floor(fu)
     floor_v = np.floor(fv)
-    au = fu - floor_u
+    au = (fu - floor_u) * weight
     av = fv - floor_v
+    half = np.float32(0.5)
+    w11 = np.int64(au * av + half)
+    w01 = np.int64(au + half) - w11
+    w10 = np.int64(weight * av + half) - w11
+    w00 = np.int64(weight + half) - w01 - w10 - w11
     u0 = np.int64(floor_u) & mask_u
     u1 = (u0 + 1) & mask_u
     v0 = np.int64(floor_v) & mask_v
     v1 = (v0 + 1) & mask_v
     a = start + (v0 << log_width)
     b = start + (v1 << log_width)
-    one = np.float32(1.0)
-    w00 = (one - au) * (one - av) * weight
-    w01 = au * (one - av) * weight
-    w10 = (one - au) * av * weight
-    w11 = au * av * weight
-    r = texels[a + u0, 0] * w00 + texels[a + u1, 0] * w01 + texels[b + u0, 0] * w10 + texels[b + u1, 0] * w11
-    g = texels[a + u0, 1] * w00 + texels[a + u1, 1] * w01 + texels[b + u0, 1] * w10 + texels[b + u1, 1] * w11
-    c = texels[a + u0, 2] * w00 + texels[a + u1, 2] * w01 + texels[b + u0, 2] * w10 + texels[b + u1, 2] * w11
-    return out[0] + r, out[1] + g, out[2] + c
+    return texels[a + u0] * w00 + texels[a + u1] * w01 + texels[b + u0] * w10 + texels[b + u1] * w11
 
 
 @numba.njit(cache=True)
@@ -277,35 +288,40 @@ def _texture_rows(gradient, rotation, camera, depth_row, rows):
         rows[t, 2] = g[2] - ax * camera[2] - ay * camera[3] + offset * depth_row[2]
 
 
-@numba.njit(cache=True, fastmath={"nnan", "ninf", "nsz", "arcp", "contract"}, error_model="numpy")
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _paint(
-    rgb, inverse_depth, owners, drawn, rejected, first_row, last_row, corners, corner_count, colour, texture, gradient, owner, alpha, grow, fog,
-    rotation, camera, texels, level_offset, log_width, log_height, levels, haze, haze_m,
+    rgb, inverse_depth, owners, drawn, rejected, first_row, last_row, corners, corner_count, gradient, shading,
+    owner, alpha, grow, rotation, camera,
 ):  # fmt: skip
+    """Scan-convert all polygons. Whole pixels are only noted in ``waiting`` and shaded at the end (or when something is
+    blended over them), so that what is painted over costs no texture reads."""
     width = inverse_depth.shape[1]
+    colour, texture = shading[0], shading[1]
+    count = corners.shape[0]
+    depth_rows, rows, spans = np.empty((count, 3)), np.zeros((count, 2, 3)), np.empty((count, 2))
+    waiting = np.full(inverse_depth.shape, -1, np.int32)
     cam = np.empty((MAX_CORNERS + 2, 3))
     edges = np.empty((MAX_CORNERS + 2, 3))
     extent = np.empty(4)
-    depth_row = np.empty(3)
-    rows = np.zeros((2, 3))
-    for n in range(corners.shape[0]):
+    plan = (depth_rows, rows, spans)
+    for n in range(count):
         left = _clip_near(corners[n], corner_count[n], rotation, cam)
         if left < 3:
             continue
         used = _edges(cam, left, camera, edges, extent)
-        if used < 3 or not _inverse_depth_row(cam, left, camera, depth_row):
+        if used < 3 or not _inverse_depth_row(cam, left, camera, depth_rows[n]):
             continue
         reach = 0.5 + grow[n]
         y0 = max(first_row, int(np.ceil(max(extent[1] - reach, -1e6))))
         y1 = min(last_row - 1, int(np.floor(min(extent[3] + reach, 1e6))))
         if y0 > y1 or extent[2] + reach < 0 or extent[0] - reach > width - 1:
             continue
-        nearest, farthest = 0.0, 1e9
+        spans[n, 0], spans[n, 1] = 1e9, 0.0
         for k in range(left):
-            nearest = max(nearest, 1.0 / cam[k, 2])
-            farthest = min(farthest, 1.0 / cam[k, 2])
+            spans[n, 0] = min(spans[n, 0], 1.0 / cam[k, 2])
+            spans[n, 1] = max(spans[n, 1], 1.0 / cam[k, 2])
         if texture[n] >= 0:
-            _texture_rows(gradient[n], rotation, camera, depth_row, rows)
+            _texture_rows(gradient[n], rotation, camera, depth_rows[n], rows[n])
         for y in range(y0, y1 + 1):
             low, high = max(0.0, extent[0] - reach), min(width - 1.0, extent[2] + reach)
             full_low, full_high = low, high
@@ -326,95 +342,127 @@ def _paint(
             x0, x1 = int(np.ceil(low)), int(np.floor(high))
             if x0 > x1:
                 continue
-            solid0, solid1 = int(np.ceil(full_low)), int(np.floor(full_high))
-            _paint_span(
-                rgb[y], inverse_depth[y], owners[y], drawn, rejected, y, x0, x1, solid0, solid1, edges, used, reach,
-                depth_row, nearest, farthest, rows, texture[n], colour[n], owner[n], alpha[n], fog[n],
-                texels, level_offset, log_width, log_height, levels, haze, haze_m,
-            )  # fmt: skip
-
-
-@numba.njit(cache=True, fastmath={"nnan", "ninf", "nsz", "arcp", "contract"}, error_model="numpy")
-def _paint_span(
-    rgb, inverse_depth, owners, drawn, rejected, y, x0, x1, solid0, solid1, edges, used, reach,
-    depth_row, nearest, farthest, rows, texture, colour, owner, alpha, fog,
-    texels, level_offset, log_width, log_height, levels, haze, haze_m,
-):  # fmt: skip
-    one = np.float32(1.0)
-    depth0 = depth_row[1] * y + depth_row[2]
-    u_row, v_row = rows[0, 1] * y + rows[0, 2], rows[1, 1] * y + rows[1, 2]
-    half = np.float32(1.0 / 255.0)
-    for start in range(x0, x1 + 1, _SEGMENT):
-        stop = min(start + _SEGMENT, x1 + 1)
-        level, blend, taps, du, dv = 0, np.float32(0.0), 1, np.float32(0.0), np.float32(0.0)
-        if texture >= 0:
-            middle = 0.5 * (start + stop - 1)
-            w = min(max(depth_row[0] * middle + depth0, farthest), nearest)
-            u, v = (rows[0, 0] * middle + u_row) / w, (rows[1, 0] * middle + v_row) / w
-            ux, uy = (rows[0, 0] - u * depth_row[0]) / w, (rows[0, 1] - u * depth_row[1]) / w
-            vx, vy = (rows[1, 0] - v * depth_row[0]) / w, (rows[1, 1] - v * depth_row[1]) / w
-            along_x, along_y = ux * ux + vx * vx, uy * uy + vy * vy
-            major, minor = max(along_x, along_y), min(along_x, along_y)
-            ratio = np.sqrt(major / max(minor, 1e-12))
-            taps = min(_MAX_TAPS, max(1, int(np.ceil(ratio - 0.2))))
-            detail = max(0.0, 0.5 * np.log2(max(major, 1e-12)) - np.log2(taps))
-            detail = min(detail, levels[texture] - 1.001)
-            level = int(detail)
-            blend = np.float32(detail - level)
-            if along_x > along_y:
-                du, dv = np.float32(ux / taps), np.float32(vx / taps)
-            else:
-                du, dv = np.float32(uy / taps), np.float32(vy / taps)
-        for x in range(start, stop):
-            inv = min(max(depth_row[0] * x + depth0, farthest), nearest)
-            if inv < inverse_depth[x] * _DEPTH_SLACK:
-                rejected[owner] += 1
-                continue
-            cover = np.float32(alpha)
-            if x < solid0 or x > solid1:
-                distance = 1e9
-                for k in range(used):
-                    distance = min(distance, edges[k, 0] * x + edges[k, 1] * y + edges[k, 2])
-                part = min(one, np.float32(distance + reach))
-                if part <= 0:
+            solid0, solid1 = max(x0, int(np.ceil(full_low))), min(x1, int(np.floor(full_high)))
+            if solid1 < solid0 or alpha[n] < np.float32(0.999):
+                solid0, solid1 = x1 + 1, x1
+            for x in range(solid0, solid1 + 1):
+                inv = np.float32(min(max(depth_rows[n, 0] * x + depth_rows[n, 1] * y + depth_rows[n, 2], spans[n, 0]), spans[n, 1]))
+                if inv < inverse_depth[y, x] * _DEPTH_SLACK:
+                    if owners[y, x] != owner[n]:
+                        rejected[owner[n]] += 1
                     continue
-                cover *= part
-            r, g, b = np.float32(255.0), np.float32(255.0), np.float32(255.0)
-            if texture >= 0:
-                u = np.float32((rows[0, 0] * x + u_row) / inv)
-                v = np.float32((rows[1, 0] * x + v_row) / inv)
-                sum3 = (np.float32(0.0), np.float32(0.0), np.float32(0.0))
-                for extra in range(2):
-                    weight = (blend if extra == 1 else one - blend) / np.float32(taps)
-                    if weight < np.float32(0.02):
+                waiting[y, x] = n
+                inverse_depth[y, x] = inv
+                if owners[y, x] != owner[n]:
+                    owners[y, x] = np.uint8(owner[n])
+                    drawn[owner[n]] += 1
+            for piece in range(2):
+                start, stop = (x0, min(solid0, x1 + 1)) if piece == 0 else (solid1 + 1, x1 + 1)
+                if piece == 1 and solid1 < solid0:
+                    continue
+                for x in range(start, stop):
+                    distance = 1e9
+                    for k in range(used):
+                        distance = min(distance, edges[k, 0] * x + edges[k, 1] * y + edges[k, 2])
+                    cover = min(np.float32(1.0), np.float32(distance + reach)) * alpha[n]
+                    if cover <= 0:
                         continue
-                    at = level + extra
-                    shrink = one / np.float32(1 << at)
-                    mask_u = (1 << log_width[texture, at]) - 1
-                    mask_v = (1 << log_height[texture, at]) - 1
-                    for tap in range(taps):
-                        shift = np.float32(tap) - np.float32(0.5 * (taps - 1))
-                        sum3 = _texel(
-                            texels, level_offset[texture, at], log_width[texture, at], mask_u, mask_v,
-                            (u + du * shift) * shrink, (v + dv * shift) * shrink, weight, sum3,
-                        )  # fmt: skip
-                r, g, b = sum3
-            r, g, b = r * colour[0] * half, g * colour[1] * half, b * colour[2] * half
-            if fog > 0:
-                haziness = np.float32(fog) / (one + np.float32(inv) * haze_m)
-                r += (haze[0] - r) * haziness
-                g += (haze[1] - g) * haziness
-                b += (haze[2] - b) * haziness
-            if cover >= np.float32(0.999):
-                rgb[x, 0] = np.uint8(min(np.float32(255.0), r + np.float32(0.5)))
-                rgb[x, 1] = np.uint8(min(np.float32(255.0), g + np.float32(0.5)))
-                rgb[x, 2] = np.uint8(min(np.float32(255.0), b + np.float32(0.5)))
-            else:
-                rgb[x, 0] = np.uint8(min(np.float32(255.0), rgb[x, 0] + (r - rgb[x, 0]) * cover + np.float32(0.5)))
-                rgb[x, 1] = np.uint8(min(np.float32(255.0), rgb[x, 1] + (g - rgb[x, 1]) * cover + np.float32(0.5)))
-                rgb[x, 2] = np.uint8(min(np.float32(255.0), rgb[x, 2] + (b - rgb[x, 2]) * cover + np.float32(0.5)))
-            if alpha >= np.float32(0.999) and cover >= np.float32(0.5):
-                inverse_depth[x] = np.float32(inv)
-                if owners[x] != owner:
-                    owners[x] = np.uint8(owner)
-                    drawn[owner] += 1
+                    inv = np.float32(min(max(depth_rows[n, 0] * x + depth_rows[n, 1] * y + depth_rows[n, 2], spans[n, 0]), spans[n, 1]))
+                    if inv < inverse_depth[y, x] * _DEPTH_SLACK:
+                        if owners[y, x] != owner[n]:
+                            rejected[owner[n]] += 1
+                        continue
+                    under = waiting[y, x]
+                    waiting[y, x] = -1
+                    for layer in range(0 if under >= 0 else 1, 2):
+                        who, opacity = (under, np.float32(1.0)) if layer == 0 else (n, cover)
+                        _shade(rgb, who, y, x, x + 1, plan, shading, opacity)
+                    if alpha[n] >= np.float32(0.999) and cover >= np.float32(0.5):
+                        inverse_depth[y, x] = inv
+                        if owners[y, x] != owner[n]:
+                            owners[y, x] = np.uint8(owner[n])
+                            drawn[owner[n]] += 1
+    for y in range(first_row, last_row):
+        x = 0
+        while x < width:
+            n = waiting[y, x]
+            stop = x + 1
+            while stop < width and waiting[y, stop] == n and stop - x < _SEGMENT:
+                stop += 1
+            if n >= 0:
+                _shade(rgb, n, y, x, stop, plan, shading, np.float32(1.0))
+            x = stop
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy", inline="always")
+def _shade(rgb, n, y, x0, x1, plan, shading, cover):
+    """Colour pixels ``[x0, x1)`` of row ``y`` by polygon ``n``; the level of detail is that of their middle."""
+    depth_rows, rows, spans = plan
+    colours, textures, fogs, texels, level_offset, log_width, log_height, levels, texture_taps, haze, haze_m = shading
+    one = np.float32(1.0)
+    texture = textures[n]
+    farthest, nearest = spans[n, 0], spans[n, 1]
+    depth_x, depth0 = depth_rows[n, 0], depth_rows[n, 1] * y + depth_rows[n, 2]
+    u_row, v_row = rows[n, 0, 1] * y + rows[n, 0, 2], rows[n, 1, 1] * y + rows[n, 1, 2]
+    u_x, v_x = rows[n, 0, 0], rows[n, 1, 0]
+    scale = np.float32(1.0 / 255.0 / 4096.0)
+    level, blend, taps, du, dv = 0, np.float32(0.0), 1, np.float32(0.0), np.float32(0.0)
+    if texture >= 0:
+        middle = 0.5 * (x0 + x1 - 1)
+        z = 1.0 / min(max(depth_x * middle + depth0, farthest), nearest)
+        u, v = (u_x * middle + u_row) * z, (v_x * middle + v_row) * z
+        ux, uy = (u_x - u * depth_x) * z, (rows[n, 0, 1] - u * depth_rows[n, 1]) * z
+        vx, vy = (v_x - v * depth_x) * z, (rows[n, 1, 1] - v * depth_rows[n, 1]) * z
+        along_x, along_y = ux * ux + vx * vx, uy * uy + vy * vy
+        major, minor = max(along_x, along_y), min(along_x, along_y)
+        ratio = np.sqrt(major / max(minor, 1e-12))
+        taps = min(texture_taps[texture], max(1, int(np.ceil(ratio - 0.2))))
+        detail = max(0.0, 0.5 * np.log2(max(major, 1e-12)) - np.log2(taps))
+        detail = min(detail, levels[texture] - 1.001)
+        level = int(detail)
+        blend = np.float32(detail - level)
+        if blend < np.float32(0.03):
+            blend = np.float32(0.0)
+        elif blend > np.float32(0.97):
+            blend = one
+        if along_x > along_y:
+            du, dv = np.float32(ux / taps), np.float32(vx / taps)
+        else:
+            du, dv = np.float32(uy / taps), np.float32(vy / taps)
+    red, green, blue, fog = colours[n, 0], colours[n, 1], colours[n, 2], fogs[n]
+    for x in range(x0, x1):
+        inv = min(max(depth_x * x + depth0, farthest), nearest)
+        r, g, b = red, green, blue
+        if texture >= 0:
+            z = 1.0 / inv
+            u32 = np.float32((u_x * x + u_row) * z)
+            v32 = np.float32((v_x * x + v_row) * z)
+            packed = np.int64(0)
+            for extra in range(2):
+                weight = (blend if extra == 1 else one - blend) * np.float32(4096.0) / np.float32(taps)
+                if weight == np.float32(0.0):
+                    continue
+                at = level + extra
+                shrink = one / np.float32(1 << at)
+                mask_u = (1 << log_width[texture, at]) - 1
+                mask_v = (1 << log_height[texture, at]) - 1
+                for tap in range(taps):
+                    shift = np.float32(tap) - np.float32(0.5) * np.float32(taps - 1)
+                    packed += _texel(
+                        texels, level_offset[texture, at], log_width[texture, at], mask_u, mask_v,
+                        (u32 + du * shift) * shrink, (v32 + dv * shift) * shrink, weight,
+                    )  # fmt: skip
+            r *= np.float32(packed & 0x1FFFFF) * scale
+            g *= np.float32((packed >> 21) & 0x1FFFFF) * scale
+            b *= np.float32(packed >> 42) * scale
+        haziness = fog / (one + np.float32(inv) * haze_m)
+        r += (haze[0] - r) * haziness
+        g += (haze[1] - g) * haziness
+        b += (haze[2] - b) * haziness
+        if cover < one:
+            r = rgb[y, x, 0] + (r - rgb[y, x, 0]) * cover
+            g = rgb[y, x, 1] + (g - rgb[y, x, 1]) * cover
+            b = rgb[y, x, 2] + (b - rgb[y, x, 2]) * cover
+        rgb[y, x, 0] = np.uint8(min(np.float32(255.0), r + np.float32(0.5)))
+        rgb[y, x, 1] = np.uint8(min(np.float32(255.0), g + np.float32(0.5)))
+        rgb[y, x, 2] = np.uint8(min(np.float32(255.0), b + np.float32(0.5)))

@@ -180,22 +180,19 @@ def _ribbon(path: StreetPath, arcs: np.ndarray, left: float, right: float) -> li
 
 def _ribbons(path: StreetPath, plan: StreetPlan) -> list[Polygons]:
     arcs = _stations(path, path.start_m + 1, path.end_m - 1)
-    kerb = 0.28
-    layers = [
-        (plan.left_m - plan.pavement_m - 7, plan.right_m + plan.pavement_m + 7, "pavement", (196, 196, 190)),
-        (plan.left_m - plan.pavement_m, plan.right_m + plan.pavement_m, "pavement", (255, 255, 255)),
-        (plan.left_m - kerb, plan.right_m + kerb, "pavement", (268, 266, 262)),
-        (plan.left_m - 0.03, plan.right_m + 0.03, "asphalt", (120, 120, 120)),
-        (plan.left_m, plan.right_m, "asphalt", (255, 255, 255)),
-    ]  # fmt: skip
-    if not plan.buildings:  # In the open the verge is grass.
-        layers = layers[2:]
+    kerb, gutter, yard = 0.28, 0.12, 9.0 if plan.buildings else 0.0  # In the open the verge is grass.
+    strips = [("asphalt", 255.0, plan.left_m, plan.right_m)]
+    for side, edge in ((-1, plan.left_m), (1, plan.right_m)):
+        cuts = (edge, edge + side * gutter, edge + side * (gutter + kerb), edge + side * (plan.pavement_m + yard))
+        for name, shade, a, b in zip(("asphalt", "pavement", "pavement"), (140.0, 290.0, 250.0), cuts, cuts[1:], strict=False):
+            if abs(b - a) > 0.05 and (plan.buildings or shade != 250.0):
+                strips.append((name, shade, min(a, b), max(a, b)))
     return [
         make_polygons(
-            _ribbon(path, arcs, left, right), colour=colour, texture=texture_index(name), gradient=ground_gradient(name),
-            grow_px=0.3,
+            _ribbon(path, arcs, left, right), colour=(shade, shade, shade), texture=texture_index(name),
+            gradient=ground_gradient(name), grow_px=0.4,
         )
-        for left, right, name, colour in layers
+        for name, shade, left, right in strips
     ]  # fmt: skip
 
 
@@ -209,7 +206,7 @@ def _markings(path: StreetPath, plan: StreetPlan) -> list[Polygons]:
                 quads += _ribbon(path, _stations(path, start, start + _DASH_M, longest=1.5), *edges)
         else:
             quads = _ribbon(path, _stations(path, path.start_m + 1, path.end_m - 1, longest=4.0), *edges)
-        parts.append(make_polygons(quads, colour=_YELLOW if line.yellow else _WHITE, grow_px=0.0))
+        parts.append(make_polygons(quads, colour=_YELLOW if line.yellow else _WHITE, grow_px=0.3))
     return parts
 
 
@@ -276,20 +273,22 @@ def _buildings(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun
         while arc < path.end_m - 30:
             width = float(rng.uniform(9, 17))
             offset = kerb + plan.pavement_m + float(rng.uniform(0.1, 0.8))
-            bend = float(path.curvature(np.array([arc, arc + width / 2, arc + width])).mean()) * side
-            house = _building(path, arc, side, offset, width, rng, sun)
-            low, high = _box(house)
-            # On the inside of a bend houses would stand in each other; near the road's other stretches, on it.
-            if bend < 0.6 / max(offset, 1.0) and not _on_road(path, low, high, corridor):
+            # On the outside of a bend the fronts fan out, on the inside they crowd: steps follow the fronts' length.
+            stretch = 1.0 - float(path.curvature(np.linspace(arc, arc + width, 5)).mean()) * side * offset
+            step = width / max(stretch, 0.25)
+            house = _building(path, arc + (step - width) / 2, side, offset, width, rng, sun)
+            if stretch > 0.3 and not _on_road(path, house, corridor):
                 houses.append(house)
-            arc += width + (0.4 if rng.random() < 0.75 else float(rng.uniform(3, 9)))
+            arc += step + (0.3 if rng.random() < 0.8 else float(rng.uniform(2, 7)))
     return houses
 
 
-def _on_road(path: StreetPath, low: np.ndarray, high: np.ndarray, corridor: float) -> bool:
-    """Whether a box on the ground comes nearer to the path than ``corridor``."""
-    inside = np.clip(path.points_xz, low[[0, 2]], high[[0, 2]])
-    return bool((np.linalg.norm(path.points_xz - inside, axis=1) < corridor).any())
+def _on_road(path: StreetPath, thing: Polygons, corridor: float) -> bool:
+    """Whether a thing's foot (its corners and the middles between them) comes nearer to the path than ``corridor``."""
+    corners = thing.corners[:, :4, [0, 2]].reshape(-1, 2).astype(np.float64)
+    spots = np.unique(np.round(np.concatenate([corners, 0.5 * (corners + np.roll(corners, 1, axis=0))]), 1), axis=0)
+    line = path.points_xz[::2]
+    return bool((np.linalg.norm(line[:, None] - spots[None], axis=-1) < corridor).any())
 
 
 def _frontal_wall(path: StreetPath) -> Polygons:
@@ -335,7 +334,7 @@ def _prism(
 
 def _blob(centre: np.ndarray, radius: float, rng: np.random.Generator, sun: np.ndarray, green: np.ndarray) -> Polygons:
     """A crown: a ball of triangles with shades of leaf, slightly out of round."""
-    rows, around = 5, 9
+    rows, around = 6, 11
     polar = np.linspace(0, np.pi, rows + 1)
     turn = np.arange(around) * 2 * np.pi / around
     nodes = np.stack([
@@ -357,13 +356,22 @@ def _blob(centre: np.ndarray, radius: float, rng: np.random.Generator, sun: np.n
     faces[inward] = faces[inward][:, ::-1]
     normal[inward] *= -1
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    shade = 0.66 + 0.34 * np.clip(normal @ sun, -0.6, 1) + rng.normal(0, 0.07, len(faces))
-    return make_polygons(list(faces), colour=green * shade[:, None], grow_px=0.4)
+    shade = 0.95 + 0.35 * np.clip(normal @ sun, -0.8, 1) - 0.12 * np.clip(normal[:, 1], 0, 1)
+    shade += rng.normal(0, 0.02, len(faces))
+    across = np.cross(normal, (0.0, 1.0, 0.0)) + (1e-6, 0.0, 0.0)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    per_m = texture_size("leaves")[0] / TEXTURE_METRES["leaves"][0]
+    gradient = np.zeros((len(faces), 2, 4))
+    gradient[:, 0, :3], gradient[:, 1, :3] = across * per_m, np.cross(normal, across) * per_m
+    gradient[:, :, 3] = -np.einsum("nij,j->ni", gradient[:, :, :3], centre) + rng.uniform(0, 256, (1, 2))
+    return make_polygons(
+        list(faces), colour=green * shade[:, None], texture=texture_index("leaves"), gradient=gradient, grow_px=0.4
+    )
 
 
 def _tree(spot: np.ndarray, rng: np.random.Generator, sun: np.ndarray) -> Polygons:
     height = float(rng.uniform(2.2, 3.2))
-    green = np.array([78, 108, 52]) * rng.uniform(0.85, 1.2) + rng.normal(0, 6, 3)
+    green = np.array([134, 158, 104]) * rng.uniform(0.85, 1.2) + rng.normal(0, 6, 3)
     parts = [_prism(spot, radius=0.16, top_radius=0.10, height=height + 0.6, colour=(96, 78, 62), sun=sun)]
     for _ in range(3):
         centre = spot + (rng.normal(0, 0.45), -height - rng.uniform(0.5, 1.8), rng.normal(0, 0.45))
@@ -396,14 +404,18 @@ def _furniture(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun
             right = np.array([np.cos(heading), 0.0, -np.sin(heading)])
             thing = _lamp(spot, -side * right, sun) if lamp else _tree(spot, rng, sun)
             bends = float(path.curvature(np.array(arc))) * side
-            if bends < 0.5 / kerb and not _on_road(path, spot - 0.1, spot + 0.1, corridor):
+            if bends < 0.5 / kerb and _clear_of_road(path, spot, corridor):
                 things.append(thing)
             arc += float(rng.uniform(9, 17))
     return things
 
 
+def _clear_of_road(path: StreetPath, spot: np.ndarray, corridor: float) -> bool:
+    return bool((np.linalg.norm(path.points_xz[::2] - spot[[0, 2]], axis=1) > corridor).all())
+
+
 def facing(polygons: Polygons, eye: np.ndarray) -> np.ndarray:
-    """(N,) bool: textured walls always; flat-coloured faces only where they turn towards ``eye``."""
+    """(N,) bool: rectangles with a texture (walls) always; other faces only where they turn towards ``eye``."""
     a, b, c = polygons.corners[:, 0], polygons.corners[:, 1], polygons.corners[:, 2]
-    normal = np.cross(b - a, c - a)
-    return (polygons.texture != NO_TEXTURE) | (np.einsum("ij,ij->i", normal, a - eye) < 0)
+    wall = (polygons.texture != NO_TEXTURE) & (polygons.corner_count == 4)
+    return wall | (np.einsum("ij,ij->i", np.cross(b - a, c - a), a - eye) < 0)

@@ -9,13 +9,13 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from dataset.street_raster import Atlas
+from dataset.street_raster import Atlas, pack_rgb
 
 TextureName = Literal[
-    "asphalt", "pavement", "grass", "sky", "plaster", "brick", "concrete", "stucco", "shop", "shutters", "wall"
+    "asphalt", "pavement", "grass", "sky", "plaster", "brick", "concrete", "stucco", "shop", "shutters", "wall", "leaves",
 ]
 TEXTURES: tuple[TextureName, ...] = (
-    "asphalt", "pavement", "grass", "sky", "plaster", "brick", "concrete", "stucco", "shop", "shutters", "wall"
+    "asphalt", "pavement", "grass", "sky", "plaster", "brick", "concrete", "stucco", "shop", "shutters", "wall", "leaves",
 )  # fmt: skip
 FACADES: tuple[TextureName, ...] = ("plaster", "brick", "concrete", "stucco")
 GROUND_FLOORS: tuple[TextureName, ...] = ("shop", "shutters")
@@ -23,11 +23,12 @@ GROUND_FLOORS: tuple[TextureName, ...] = ("shop", "shutters")
 TEXTURE_METRES: dict[TextureName, tuple[float, float]] = {
     "asphalt": (8.0, 8.0), "pavement": (4.0, 4.0), "grass": (8.0, 8.0), "sky": (0.0, 0.0),
     "plaster": (12.8, 12.8), "brick": (12.8, 12.8), "concrete": (12.8, 12.8), "stucco": (12.8, 12.8),
-    "shop": (12.8, 3.6), "shutters": (12.8, 3.6), "wall": (6.4, 6.4),
+    "shop": (12.8, 3.6), "shutters": (12.8, 3.6), "wall": (6.4, 6.4), "leaves": (2.4, 2.4),
 }  # fmt: skip
 """Width and height in metres that one repeat covers."""
 
 _LEVELS = 11
+_PLAIN = ("grass", "sky", "leaves")
 SKY_TANGENTS = (-0.06, 0.74)
 """Tangent of the elevation at the bottom and the top of the sky's texture."""
 HAZE = (196.0, 207.0, 217.0)
@@ -44,7 +45,7 @@ def street_atlas() -> Atlas:
     """All textures with their mip chains, each level the mean over 2x2 texels of the one before."""
     painters = {
         "asphalt": _asphalt, "pavement": _pavement, "grass": _grass, "sky": _sky, "plaster": _plaster, "brick": _brick,
-        "concrete": _concrete, "stucco": _stucco, "shop": _shop, "shutters": _shutters, "wall": _wall,
+        "concrete": _concrete, "stucco": _stucco, "shop": _shop, "shutters": _shutters, "wall": _wall, "leaves": _leaves,
     }  # fmt: skip
     count = len(TEXTURES)
     offset, levels = np.zeros((count, _LEVELS), np.int64), np.zeros(count, np.int32)
@@ -57,14 +58,15 @@ def street_atlas() -> Atlas:
             height, width = picture.shape[:2]
             offset[index, level] = at
             log_width[index, level], log_height[index, level] = int(np.log2(width)), int(np.log2(height))
-            chunks.append(np.round(picture).astype(np.uint8).reshape(-1, 3))
+            chunks.append(pack_rgb(np.round(picture).astype(np.uint8).reshape(-1, 3)))
             at += width * height
             levels[index] += 1
             if levels[index] == _LEVELS or min(width, height) == 2:
                 break
             picture = picture.reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
     return Atlas(
-        texels=np.concatenate(chunks), offset=offset, log_width=log_width, log_height=log_height, levels=levels
+        texels=np.concatenate(chunks), offset=offset, log_width=log_width, log_height=log_height, levels=levels,
+        taps=np.array([1 if name in _PLAIN else 2 for name in TEXTURES], np.int32),
     )
 
 
@@ -99,7 +101,7 @@ def _flat(size: tuple[int, int], colour: tuple[float, float, float]) -> np.ndarr
 def _asphalt(rng: np.random.Generator) -> np.ndarray:
     size = (512, 512)
     grain = _noise(rng, size, ((512, 6.0), (128, 5.0), (32, 4.0), (8, 4.0)))
-    picture = _flat(size, (94, 95, 99)) + grain[..., None]
+    picture = _flat(size, (108, 109, 113)) + grain[..., None]
     for _ in range(7):  # Tar seams and cracks.
         points = np.cumsum(rng.normal(0, 22, (9, 2)), axis=0) + rng.uniform(0, 512, 2)
         shade = float(rng.uniform(58, 72))
@@ -280,3 +282,16 @@ def _shutters(rng: np.random.Generator) -> np.ndarray:
 def _wall(rng: np.random.Generator) -> np.ndarray:
     size = (512, 512)
     return _flat(size, (184, 174, 162)) + _noise(rng, size, ((256, 5.0), (64, 7.0), (16, 8.0), (4, 5.0)))[..., None]
+
+
+def _leaves(rng: np.random.Generator) -> np.ndarray:
+    size = (256, 256)
+    picture = _flat(size, (150, 168, 120)) + _noise(rng, size, ((128, 12.0), (32, 22.0), (8, 14.0)))[..., None]
+    for _ in range(900):
+        x, y = (int(value) for value in rng.integers(0, 256, 2))
+        shade = float(rng.normal(1.0, 0.22))
+        colour = (168 * shade, 190 * shade, 126 * shade)
+        for shift_x in (-256, 0, 256):
+            axes = (int(rng.integers(3, 7)), int(rng.integers(2, 4)))
+            cv2.ellipse(picture, (x + shift_x, y), axes, float(rng.uniform(0, 180)), 0, 360, colour, -1, cv2.LINE_AA)
+    return picture
