@@ -97,7 +97,7 @@ class ClipViews:
             raise DataError(f"{self.sample.key}.{name}.mp4 has {len(frames)} frames, {self.indices[-1] + 1} are needed")
         return frames[self.indices]
 
-    def _sizes(self) -> dict[str, int]:
+    def _sizes(self) -> dict[str, Any]:
         return {
             "width": self.picture.control_width, "height": self.picture.control_height,
             "label_width": self.label_width, "label_height": self.label_height,

@@ -56,6 +56,9 @@ def sampling_sigmas(steps: int, *, tokens: int, convention: Convention = "consis
         use_dynamic_shifting=True, base_shift=BASE_SHIFT, max_shift=MAX_SHIFT, base_image_seq_len=BASE_TOKENS,
         max_image_seq_len=MAX_TOKENS, shift_terminal=0.1,
     )  # fmt: skip
+    if steps == 1:
+        # One step has no room to stretch.
+        return torch.tensor([1.0, 0.0])
     linear = torch.linspace(1.0, 1.0 / steps, steps)
     mu = shift_for_tokens(tokens, convention=convention)
     scheduler.set_timesteps(sigmas=linear.tolist(), mu=mu)

@@ -100,7 +100,7 @@ class ClipGenerator:
         given: dict[Stage, Path | None] = {
             "motion": self.motion, "appearance": self.appearance, "end_to_end": self.end_to_end,
         }  # fmt: skip
-        chosen = {stage: Path(path) for stage, path in given.items() if path is not None}
+        chosen: dict[Stage, Path] = {stage: Path(path) for stage, path in given.items() if path is not None}
         if not chosen or ("end_to_end" in chosen and len(chosen) > 1):
             raise ConfigError("give --motion and --appearance (either alone works too), or --end-to-end alone")
         for stage, path in chosen.items():

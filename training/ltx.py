@@ -64,9 +64,10 @@ class LtxBackbone:
             part = self._makers[name]()
             for module in part if isinstance(part, tuple) else (part,):
                 if isinstance(module, torch.nn.Module):
+                    module.to(self.device)
                     # A cast that changes nothing would only make diffusers warn.
-                    wrong = any(weight.dtype != self.dtype for weight in module.parameters())
-                    module.to(device=self.device, **({"dtype": self.dtype} if wrong else {}))
+                    if any(weight.dtype != self.dtype for weight in module.parameters()):
+                        module.to(self.dtype)
                     module.eval().requires_grad_(False)
             self._parts[name] = part
         return self._parts[name]

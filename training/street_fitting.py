@@ -29,6 +29,7 @@ class FitSettings:
     precision: torch.dtype = torch.bfloat16
     """Of convolutions and products; weights and losses stay float32."""
     report_every: int = 200
+    name: str = "network"
 
 
 def fit(network: nn.Module, make_batch: BatchMaker, loss_of: LossFunction, settings: FitSettings) -> nn.Module:
@@ -59,7 +60,7 @@ def fit(network: nn.Module, make_batch: BatchMaker, loss_of: LossFunction, setti
         _update_average(average, network, min(settings.average_decay, (step + 1) / (step + 10)))
         recent.append(float(loss.detach()))
         if (step + 1) % settings.report_every == 0:
-            print(f"  step {step + 1:5d} of {settings.steps}: loss {np.mean(recent):.4f}", flush=True)
+            print(f"  {settings.name}: step {step + 1} of {settings.steps}, loss {np.mean(recent):.4f}", flush=True)
             recent.clear()
     return average.eval()
 

@@ -1,12 +1,13 @@
 """Train, export and judge the small shipped extractors of the synthetic street: ``python -m training.street_models``.
 
-Everything follows from the seeds: pool, batches, weights, ONNX bytes (on one kind of processor and thread count).
+Everything follows from the seeds: pool, batches, weights, ONNX bytes (on one kind of processor).
 """
 
 import argparse
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -41,7 +42,8 @@ from training.street_targets import grid_cells
 
 ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_lane24"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
-THREADS = 2
+WORKERS = 2
+"""Processes that render and train."""
 TRAIN_SEED, HELD_OUT_SEED = 20_000, 90_000
 """First street seed of either set; no street is in both."""
 PLANNED: tuple[Scenario, ...] = (
@@ -122,7 +124,7 @@ def _detector_recipe(seed: int, share: float) -> Recipe:
         card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph,
         batches=lambda pool: DetectorBatches(pool=pool, size=_WINDOW, count=16, augment=AugmentSettings()),
         loss=loss,
-        fit=FitSettings(seed=seed, steps=_steps(3000, share)),
+        fit=FitSettings(name=card.name, seed=seed, steps=_steps(3000, share)),
     )  # fmt: skip
 
 
@@ -144,7 +146,7 @@ def _head_recipe(name: str, schema: str, seed: int, share: float) -> Recipe:
         batches=lambda pool: CropBatches(
             crops=pool.crops[category], schema=schema, size=size, count=64, augment=augment
         ),
-        fit=FitSettings(seed=seed, steps=_steps(2200, share)),
+        fit=FitSettings(name=name, seed=seed, steps=_steps(2200, share)),
     )  # fmt: skip
 
 
@@ -172,7 +174,7 @@ def _field_recipe(name: str, schemas: tuple[str, ...], seed: int, share: float) 
         batches=lambda pool: FieldBatches(
             pool=pool, schemas=schemas, size=_FIELD_SIZE, count=8, augment=AugmentSettings()
         ),
-        fit=FitSettings(seed=seed, steps=_steps(2000, share)),
+        fit=FitSettings(name=name, seed=seed, steps=_steps(2000, share)),
     )  # fmt: skip
 
 
@@ -181,6 +183,27 @@ def train_model(plan: Recipe, pool: StreetPool, folder: Path) -> ModelCard:
     torch.manual_seed(plan.fit.seed)
     network = fit(plan.network(), plan.batches(pool), plan.loss, plan.fit)
     return export_model(plan.graph(network), plan.card, folder)
+
+
+_shared_pool: list[StreetPool] = []
+
+
+def train_models(names: Sequence[ModelName], pool: StreetPool, folder: Path, *, seed: int, share: float) -> None:
+    """Train several models side by side, one thread each, the longest first; their bytes do not depend on company."""
+    _shared_pool[:] = [pool]
+    jobs: list[tuple[ModelName, Path, int, float]] = [(name, folder, seed, share) for name in names]
+    # Forked workers see the pool where it is: it would take longer to send than to render.
+    with get_context("fork").Pool(min(WORKERS, len(jobs)), maxtasksperchild=1) as workers:
+        for name, seconds in workers.imap_unordered(_train_job, jobs):
+            print(f"{name} trained and exported in {seconds:.0f} s", flush=True)
+
+
+def _train_job(job: tuple[ModelName, Path, int, float]) -> tuple[str, float]:
+    name, folder, seed, share = job
+    torch.set_num_threads(1)
+    start = time.perf_counter()
+    train_model(recipe(name, seed=seed, share=share), _shared_pool[0], folder)
+    return name, time.perf_counter() - start
 
 
 def evaluate(folder: Path, *, streets: int = 30, frames: int = 6) -> dict[str, float]:
@@ -238,17 +261,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--judged-streets", type=int, default=30)
     parser.add_argument("--share", type=float, default=1.0, help="share of the full number of steps")
     options = parser.parse_args(arguments)
-    torch.set_num_threads(THREADS)
     cv2.setNumThreads(1)
     options.out.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     if not options.evaluate:
-        pool = render_pool(plan_streets(TRAIN_SEED, options.streets))
+        pool = render_pool(plan_streets(TRAIN_SEED, options.streets), workers=WORKERS)
         counts = {name: len(found) for name, found in pool.crops.items()}
         print(f"{len(pool.frames)} frames, crops {counts}, {time.perf_counter() - start:.0f} s", flush=True)
-        for name in options.only:
-            print(f"{name}, {time.perf_counter() - start:.0f} s", flush=True)
-            train_model(recipe(name, seed=options.seed, share=options.share), pool, options.out)
+        train_models(options.only, pool, options.out, seed=options.seed, share=options.share)
     frames = 6
     figures = evaluate(options.out, streets=options.judged_streets, frames=frames)
     write_figures(options.out, figures, streets=options.judged_streets, frames=frames)

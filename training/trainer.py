@@ -274,7 +274,7 @@ class Trainer:
         if self.accelerator.is_main_process:
             write_validation_videos(
                 self.backbone, self.items, self.store, self.config, out=self.out, step=self.step,
-                autocast=self.accelerator.autocast,
+                autocast=lambda: self.accelerator.autocast(),
             )  # fmt: skip
         self.accelerator.wait_for_everyone()
 
