@@ -147,27 +147,6 @@ def padded_input(frame: np.ndarray, card: CifcafCard) -> tuple[np.ndarray, float
     return planes, ratio
 
 
-def complete_lane(points: np.ndarray) -> np.ndarray:
-    """A lane's present points, joined and resampled to K evenly spaced ones, nearest first.
-
-    Args:
-        points: (K, 3) float32: x, y, score; at least two present.
-
-    Returns:
-        (K, 3) float32: evenly spaced along the line from the first present point to the last, each scored by the lesser
-        of its neighbours; all zero where fewer than two points are present.
-    """
-    line = points[points[:, 2] > 0]
-    if len(line) < 2:
-        return np.zeros_like(points)
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
-    places = np.linspace(0, along[-1], len(points))
-    after = np.clip(np.searchsorted(along, places), 1, len(line) - 1)
-    scores = np.minimum(line[after - 1, 2], line[after, 2])
-    columns = [np.interp(places, along, line[:, axis]) for axis in range(2)]
-    return np.stack([*columns, scores], axis=1).astype(points.dtype)
-
-
 def object_scores(point_scores: np.ndarray) -> np.ndarray:
     """(M,) scores of objects from (M, K) scores of their points: a mean, the three best counted three times."""
     weights = np.ones(point_scores.shape[1])

@@ -12,13 +12,11 @@ import numpy as np
 
 from labeling.model_cards import SimccCard
 from labeling.onnx_model import DEFAULT_PROVIDERS, OnnxModel, check_frame, network_input
-from labeling.schemas import facts
 
 SMALL_PERSON_PX = 100.0
 """A person lower than this shows no fingers and no face: 17 joints are all there is to see."""
 BODY_JOINTS = 17
 """The first points of ``wholebody133`` are ``coco17``."""
-_NECK_THRESHOLD = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,27 +178,6 @@ def crop_input(frame: np.ndarray, crop: Crop, card: SimccCard) -> np.ndarray:
     check_frame(frame)
     picture = cv2.warpAffine(frame, crop.frame_to_input, crop.input_xy, flags=cv2.INTER_LINEAR)
     return network_input(picture, card)
-
-
-def to_openpose18(points: np.ndarray) -> np.ndarray:
-    """OpenPose's 18 body points from ``wholebody133`` or ``coco17``, as DWPose draws them.
-
-    The neck is the middle of the shoulders, there only if both score over 0.3, and scored by the lesser.
-
-    Args:
-        points: (..., 133 or 17, 3) float32: x, y, score.
-
-    Returns:
-        (..., 18, 3) float32.
-    """
-    sources = facts()["openpose18"]["from_wholebody133"]
-    neck_row = sources.index(None)
-    result = points[..., [0 if source is None else source for source in sources], :].copy()
-    names = facts()["wholebody133"]["names"]
-    shoulders = points[..., [names.index("left_shoulder"), names.index("right_shoulder")], :]
-    neck = np.concatenate([shoulders[..., :2].mean(axis=-2), shoulders[..., 2].min(axis=-1)[..., None]], axis=-1)
-    result[..., neck_row, :] = np.where(neck[..., 2:] > _NECK_THRESHOLD, neck, 0)
-    return result
 
 
 def _in_frame(decoded: np.ndarray, crop: Crop) -> np.ndarray:

@@ -10,7 +10,7 @@ from field_reference import PlainDecoder
 
 from labeling import field_growth
 from labeling.errors import ModelError
-from labeling.fields import FieldDecoder, FieldModel, complete_lane, object_scores, padded_input
+from labeling.fields import FieldDecoder, FieldModel, object_scores, padded_input
 from labeling.model_cards import CifcafCard, FieldHeadCard
 from labeling.schemas import keypoint_schema
 
@@ -158,18 +158,6 @@ def test_object_scores_count_the_best_three_thrice() -> None:
     scores[0, :4] = 0.9, 0.6, 0.3, 0.2
     assert object_scores(scores)[0] == pytest.approx((3 * 1.8 + 0.2) / 30)
     assert object_scores(np.ones((1, 66)))[0] == pytest.approx(1)
-
-
-def test_a_completed_lane_is_even_and_stays_on_its_line() -> None:
-    points = np.zeros((24, 3), np.float32)
-    points[[2, 3, 9, 17]] = [[100, 600, 0.9], [110, 580, 0.8], [200, 400, 0.7], [300, 200, 0.5]]
-    lane = complete_lane(points)
-    steps = np.hypot(*np.diff(lane[:, :2], axis=0).T)
-    np.testing.assert_allclose(steps, steps.mean(), rtol=0.01)
-    np.testing.assert_allclose(lane[[0, -1], :2], [[100, 600], [300, 200]], atol=1e-3)
-    np.testing.assert_allclose((lane[:, 0] - 100) * 2, 600 - lane[:, 1], atol=1e-2)
-    assert set(lane[:, 2]) == set(np.array([0.8, 0.7, 0.5], np.float32))
-    assert not complete_lane(np.zeros((24, 3), np.float32)).any()
 
 
 def field_card(**changes: object) -> CifcafCard:

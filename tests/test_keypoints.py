@@ -9,7 +9,7 @@ import pytest
 from onnx import helper
 
 from labeling.errors import ModelError
-from labeling.keypoints import KeypointHead, PersonHead, decode_simcc, plan_crop, to_openpose18
+from labeling.keypoints import KeypointHead, PersonHead, decode_simcc, plan_crop
 from labeling.model_cards import SimccCard
 from labeling.schemas import keypoint_schema
 
@@ -160,21 +160,3 @@ class TestPeople:
         none = np.zeros((0, 4), np.float32)
         (points,) = PersonHead(make_head(tmp_path, "wholebody133")).estimate([self.FRAME], [none])
         assert points.shape == (0, 133, 3)
-
-
-class TestOpenpose:
-    def test_joints_go_to_their_places(self) -> None:
-        body = keypoint_schema("wholebody133").point_names
-        points = np.random.default_rng(0).uniform(0.4, 1, (2, 133, 3)).astype(np.float32)
-        converted = to_openpose18(points)
-        for i, name in enumerate(keypoint_schema("openpose18").point_names):
-            if name != "neck":
-                np.testing.assert_array_equal(converted[:, i], points[:, body.index(name)])
-        np.testing.assert_array_equal(to_openpose18(points[:, :17]), converted)
-
-    @pytest.mark.parametrize("left, right, seen", [(0.9, 0.5, 0.5), (0.9, 0.3, 0), (0, 0.9, 0), (0.31, 0.32, 0.31)])
-    def test_the_neck_needs_both_shoulders(self, left: float, right: float, seen: float) -> None:
-        points = np.zeros((17, 3), np.float32)
-        points[5], points[6] = (100, 50, left), (140, 60, right)
-        neck = to_openpose18(points)[1]
-        np.testing.assert_allclose(neck, (120, 55, seen) if seen else (0, 0, 0), rtol=1e-6)
