@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from labeling.conversion import tag_bt709
 from labeling.errors import ConfigError, StorageError, VideoError
+from labeling.mp4_boxes import indexed_frames
 
 Codec = Literal["libx264", "libx264rgb"]
 Preset = Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow"]
@@ -220,11 +221,7 @@ def _check_whole(packets: list[av.Packet], source: Path, *, start: int, end: int
 
 def check_written(path: Path, frames: int) -> None:
     """Raise ``StorageError`` unless the index lists that many frames: a muxer may swallow a failed last write."""
-    try:
-        with av.open(str(path)) as container:
-            found = container.streams.video[0].frames
-    except (av.error.FFmpegError, OSError, IndexError) as error:
-        raise StorageError(f"{path}: was not written whole ({error}); free some space and start again") from error
+    found = indexed_frames(path)
     if found != frames:
         raise StorageError(f"{path}: holds {found} of {frames} frames; free some space and start again")
 

@@ -1,5 +1,8 @@
 """From a source's decoded frames to the constant-rate frames of a run, one at a time."""
 
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
 import av
 import cv2
 import numpy as np
@@ -14,11 +17,10 @@ from labeling.video import SAME_TIME_S, SourceFrame
 class RunEncoder:
     """Shows each wanted source frame for as many grid frames as want it, and remembers what was lost."""
 
-    def __init__(self, wanted_s: np.ndarray, *, writer: VideoWriter, converter: FrameConverter) -> None:
+    def __init__(self, wanted_s: np.ndarray, *, writer: VideoWriter) -> None:
         """``wanted_s`` is (N,) float64, rising: the source time that each frame of the run shows."""
         self._wanted_s = wanted_s
         self._writer = writer
-        self._converter = converter
         self._next = 0
         self._shown: av.VideoFrame | None = None
         self._thumbnails: list[np.ndarray] = []
@@ -28,21 +30,20 @@ class RunEncoder:
         """(N,) bool, frames whose source frame did not decode, or came out damaged."""
 
     def show(self, frame: SourceFrame) -> None:
-        """Take the next decoded frame; it is converted and encoded only if the run wants it."""
+        """Take the next frame out of ``converted_frames``; it is encoded if the run wants it."""
         start = self._next
-        first = start + int(np.searchsorted(self._wanted_s[start:], frame.time_s - SAME_TIME_S))
-        end = first + int(np.searchsorted(self._wanted_s[first:], frame.time_s + SAME_TIME_S))
+        first, end = _rows(self._wanted_s, frame.time_s)
         self._mark(frame, first, end)
         if end == first:
             return
         # What was wanted between the last frame and this one never came.
         self.lost[start:first] = True
         if self._shown is None:
-            self._convert(frame)
+            self._take(frame.picture)
             self._repeat(first - start)
         else:
             self._repeat(first - start)
-            self._convert(frame)
+            self._take(frame.picture)
         self._repeat(end - first)
 
     def finish(self, source: object) -> None:
@@ -75,9 +76,9 @@ class RunEncoder:
         else:
             self._bidirectional.extend(range(first, end))
 
-    def _convert(self, frame: SourceFrame) -> None:
-        self._shown = self._converter.convert(frame.picture)
-        grey = luma(self._shown) if self._shown.format.name == "yuv420p" else _grey(self._shown)
+    def _take(self, picture: av.VideoFrame) -> None:
+        self._shown = picture
+        grey = luma(picture) if picture.format.name == "yuv420p" else _grey(picture)
         self._thumbnails.append(thumbnail(grey))
 
     def _repeat(self, times: int) -> None:
@@ -86,6 +87,21 @@ class RunEncoder:
             self._writer.write_frame(self._shown)
             self._thumbnail_of[self._next] = len(self._thumbnails) - 1
             self._next += 1
+
+
+def converted_frames(
+    frames: Iterable[SourceFrame], wanted_s: np.ndarray, converter: FrameConverter
+) -> Iterator[SourceFrame]:
+    """All the frames; those that are wanted with their picture converted."""
+    for frame in frames:
+        first, end = _rows(wanted_s, frame.time_s)
+        yield replace(frame, picture=converter.convert(frame.picture)) if end > first else frame
+
+
+def _rows(wanted_s: np.ndarray, time_s: float) -> tuple[int, int]:
+    """The frames ``[first, end)`` of a run that show a source frame."""
+    first, end = np.searchsorted(wanted_s, (time_s - SAME_TIME_S, time_s + SAME_TIME_S))
+    return int(first), int(end)
 
 
 def _grey(picture: av.VideoFrame) -> np.ndarray:

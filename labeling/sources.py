@@ -12,6 +12,7 @@ import av.error
 from av.stream import Discard, Disposition
 
 from labeling.errors import VideoError
+from labeling.mp4_boxes import top_level_boxes
 
 SAME_TIME_S = 1e-6
 """Two times closer than this are the same frame's."""
@@ -42,32 +43,13 @@ def open_video(path: Path) -> av.container.InputContainer:
 def _why_unreadable(path: Path, error: Exception) -> str:
     if isinstance(error, PermissionError):
         return f"{path}: may not be read ({error.strerror}); change its permissions"
-    boxes = _mp4_boxes(path)
+    boxes = [box.name for box in top_level_boxes(path)]
     if "ftyp" in boxes and "moov" not in boxes:
         return (
             f"{path}: is an MP4 without its index (no moov box: found {', '.join(boxes)}); the recording or the copy "
             "was cut off, get the file again"
         )
     return f"{path}: is not a video that can be read ({error.__class__.__name__}); check what the file is"
-
-
-def _mp4_boxes(path: Path) -> list[str]:
-    """Names of the top-level boxes, as far as they can be followed."""
-    names: list[str] = []
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        at = 0
-        while at + 8 <= size and len(names) < 64:
-            file.seek(at)
-            header = file.read(16)
-            length = int.from_bytes(header[:4], "big")
-            if length == 1:
-                length = int.from_bytes(header[8:16], "big")
-            if not header[4:8].isalnum() or (length < 8 and length != 0):
-                break
-            names.append(header[4:8].decode("ascii", "replace"))
-            at = at + length if length else size
-    return names
 
 
 def pick_video_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:

@@ -16,13 +16,16 @@ from labeling.camera import PictureMap
 from labeling.conversion import FrameConverter, OutputPicture
 from labeling.encoding import EncoderSettings, VideoWriter, copy_packets
 from labeling.errors import ConfigError, VideoError
-from labeling.run_encoder import RunEncoder
+from labeling.read_ahead import read_ahead
+from labeling.run_encoder import RunEncoder, converted_frames
 from labeling.video import HOLE_S, SAME_TIME_S, probe, source_frames
 
 FPS = 24
 
 # Times come from integer ticks of 1e-6 s or more, so a tie is exact but for rounding.
 _TIE_S = 1e-7
+# Decoding and converting run beside encoding, as in ffmpeg itself.
+_FRAMES_AHEAD = 4
 _VIDEO_ID = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -272,8 +275,8 @@ def cut_run(
     with VideoWriter(
         out_mp4, width=picture.width, height=picture.height, fps=timeline.fps, settings=settings
     ) as writer:
-        run = RunEncoder(wanted, writer=writer, converter=FrameConverter(output))
-        for frame in frames:
+        run = RunEncoder(wanted, writer=writer)
+        for frame in read_ahead(converted_frames(frames, wanted, FrameConverter(output)), depth=_FRAMES_AHEAD):
             run.show(frame)
         run.finish(source)
     return RunFrames(
