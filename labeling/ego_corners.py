@@ -17,8 +17,8 @@ class TrackSettings(BaseModel):
 
     long_side: int = Field(default=640, ge=64)
     """The working picture's longer side; larger pictures are shrunk to it, smaller ones are left alone."""
-    corners: int = Field(default=360, ge=50)
-    window: int = Field(default=15, ge=5)
+    corners: int = Field(default=320, ge=50)
+    window: int = Field(default=11, ge=5)
     """Side of the Lucas-Kanade window."""
     levels: int = Field(default=3, ge=0)
     """Pyramid levels above the first."""

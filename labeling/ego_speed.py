@@ -129,6 +129,8 @@ def _tridiagonal(
 ) -> np.ndarray:
     """Least squares of observations, ties ``u[i+1] - u[i] = change[i]`` and stiffness ``u[i+1] = u[i]``."""
     count = len(weight)
+    if count == 1:
+        return weighted / (weight + 1e-9)
     bands = np.zeros((2, count))
     bands[1] = weight + 1e-9
     right = weighted.copy()
