@@ -174,12 +174,33 @@ def inspect(
     raise typer.Exit(inspect_job(job, key, sheet=sheet, as_json=as_json))
 
 
-@app.command(rich_help_panel=LOOK)
-def models(models: Models = None, as_json: AsJson = False) -> None:
-    """The model cards, which weights are present, and how to get the others."""
-    from pipelines.models import print_models
+models_app = typer.Typer()
+app.add_typer(models_app, name="models", rich_help_panel=LOOK)
 
-    raise typer.Exit(print_models(models, as_json=as_json))
+
+@models_app.callback(invoke_without_command=True)
+def list_models(context: typer.Context, models: Models = None, as_json: AsJson = False) -> None:
+    """The model cards, which weights are present, and how to get the others; `check` tries one."""
+    if context.invoked_subcommand is None:
+        from pipelines.models import print_models
+
+        raise typer.Exit(print_models(models, as_json=as_json))
+
+
+@models_app.command("check")
+def check_model(
+    card: Annotated[str, typer.Argument(help="Name of a model card.")],
+    image: Annotated[
+        list[Path] | None,
+        typer.Option(help="A picture, or a video, that shows what the network looks for; repeatable."),
+    ] = None,
+    models: Models = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a model as its card says, and as the card's likely mistakes would: which fits?"""
+    from pipelines.model_check import print_check
+
+    raise typer.Exit(print_check(card, image or [], models_dir=models, as_json=as_json))
 
 
 export_app = typer.Typer(help="Write a packed job in other forms.", no_args_is_help=True)

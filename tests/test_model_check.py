@@ -36,7 +36,8 @@ def blue_seeker(path: Path, card: ModelCard, *, logits: bool = False) -> Path:
     mask = np.zeros((84, 2), np.float32)
     mask[10] = 1
     weights = {
-        "wanted": wanted[None].astype(np.float32), "sharp": np.array([-4 / np.ptp(wanted)], np.float32), "boxes": boxes[None],
+        "wanted": wanted[None].astype(np.float32), "boxes": boxes[None],
+        "sharp": np.array([-4 / np.ptp(wanted)], np.float32),
         "mask": mask[None], "rows": np.array([-1, 1, 1]), "none": np.zeros((1,), np.float32),
     }  # fmt: skip
     nodes = [
