@@ -25,8 +25,8 @@ Codec = Literal["libx264", "libx264rgb"]
 Preset = Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow"]
 
 
-# With AVX-512 x264's macroblock tree reads memory that it never wrote, so the same frames gave up to 7 different files in
-# 150 encodes (measured at 96x64 to 1056x704); with AVX2 they never do, at the same speed and size.
+# With AVX-512 x264's macroblock tree reads memory that it never wrote: the same frames gave up to 7 different files in
+# 150 encodes (measured, 96x64 to 1056x704). With AVX2 they never do, at the same speed and size.
 _CPU_AVX_512F = 13
 _REPRODUCIBLE = ":asm=avx2" if cv2.checkHardwareSupport(_CPU_AVX_512F) else ""
 
