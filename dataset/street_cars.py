@@ -307,7 +307,7 @@ def _mirrors(make: _Builder, size: CarSize) -> dict[str, np.ndarray]:
         make.solids.append(make.hull(np.array(box), part, gloss=0.3))
         glass = np.array([(x - 0.052, inner + side * 0.03, low + 0.04), (x - 0.052, outer - side * 0.02, low + 0.02),
                           (x - 0.052, outer - side * 0.02, low + 0.13), (x - 0.052, inner + side * 0.03, low + 0.12)])  # fmt: skip
-        make.detail(glass, (-1, 0, 0), part, (150, 166, 182), gloss=0.4)
+        make.detail(glass, (-1, 0, 0), part, (78, 88, 100), gloss=0.2)
         named[f"mirror_edge_{word}"] = np.array([x + 0.01, outer, low + 0.075])
     return named
 

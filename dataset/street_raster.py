@@ -406,7 +406,9 @@ def _shade(rgb, n, y, x0, x1, plan, shading, cover):
     u_row, v_row = rows[n, 0, 1] * y + rows[n, 0, 2], rows[n, 1, 1] * y + rows[n, 1, 2]
     u_x, v_x = rows[n, 0, 0], rows[n, 1, 0]
     scale = np.float32(1.0 / 255.0 / 4096.0)
-    level, blend, taps, du, dv = 0, np.float32(0.0), 1, np.float32(0.0), np.float32(0.0)
+    half, zero = np.float32(0.5), np.float32(0.0)
+    taps, du, dv, weight0, weight1, centre, shrink = 1, zero, zero, zero, zero, zero, one
+    start0, start1, width0, mask_u0, mask_v0 = np.int64(0), np.int64(0), np.int64(0), 1, 1
     if texture >= 0:
         middle = 0.5 * (x0 + x1 - 1)
         z = 1.0 / min(max(depth_x * middle + depth0, farthest), nearest)
@@ -417,14 +419,20 @@ def _shade(rgb, n, y, x0, x1, plan, shading, cover):
         major, minor = max(along_x, along_y), min(along_x, along_y)
         ratio = np.sqrt(major / max(minor, 1e-12))
         taps = min(texture_taps[texture], max(1, int(np.ceil(ratio - 0.2))))
-        detail = max(0.0, 0.5 * np.log2(max(major, 1e-12)) - np.log2(taps))
-        detail = min(detail, levels[texture] - 1.001)
+        detail = max(0.0, 0.5 * np.log2(max(major, 1e-12) / (taps * taps)))
+        detail = min(detail, levels[texture] - 1.34)
         level = int(detail)
-        blend = np.float32(detail - level)
-        if blend < np.float32(0.03):
-            blend = np.float32(0.0)
-        elif blend > np.float32(0.97):
-            blend = one
+        # Levels blend over the middle third only: two thirds of the pixels then read one level, and no step shows.
+        blend = min(one, max(zero, (np.float32(detail - level) - np.float32(0.33)) * np.float32(3.0)))
+        if blend == one:
+            level, blend = level + 1, zero
+        weight0 = (one - blend) * np.float32(4096.0) / np.float32(taps)
+        weight1 = blend * np.float32(4096.0) / np.float32(taps)
+        centre = half * np.float32(taps - 1)
+        shrink = one / np.float32(1 << level)
+        start0, start1 = level_offset[texture, level], level_offset[texture, level + 1]
+        width0 = np.int64(log_width[texture, level])
+        mask_u0, mask_v0 = (1 << width0) - 1, (1 << np.int64(log_height[texture, level])) - 1
         if along_x > along_y:
             du, dv = np.float32(ux / taps), np.float32(vx / taps)
         else:
@@ -438,20 +446,14 @@ def _shade(rgb, n, y, x0, x1, plan, shading, cover):
             u32 = np.float32((u_x * x + u_row) * z)
             v32 = np.float32((v_x * x + v_row) * z)
             packed = np.int64(0)
-            for extra in range(2):
-                weight = (blend if extra == 1 else one - blend) * np.float32(4096.0) / np.float32(taps)
-                if weight == np.float32(0.0):
-                    continue
-                at = level + extra
-                shrink = one / np.float32(1 << at)
-                mask_u = (1 << log_width[texture, at]) - 1
-                mask_v = (1 << log_height[texture, at]) - 1
-                for tap in range(taps):
-                    shift = np.float32(tap) - np.float32(0.5) * np.float32(taps - 1)
-                    packed += _texel(
-                        texels, level_offset[texture, at], log_width[texture, at], mask_u, mask_v,
-                        (u32 + du * shift) * shrink, (v32 + dv * shift) * shrink, weight,
-                    )  # fmt: skip
+            for tap in range(taps):
+                shift = np.float32(tap) - centre
+                u1, v1 = (u32 + du * shift) * shrink, (v32 + dv * shift) * shrink
+                packed += _texel(texels, start0, width0, mask_u0, mask_v0, u1, v1, weight0)
+                if weight1 > np.float32(0.0):
+                    u1 *= half
+                    v1 *= half
+                    packed += _texel(texels, start1, width0 - 1, mask_u0 >> 1, mask_v0 >> 1, u1, v1, weight1)
             r *= np.float32(packed & 0x1FFFFF) * scale
             g *= np.float32((packed >> 21) & 0x1FFFFF) * scale
             b *= np.float32(packed >> 42) * scale

@@ -267,7 +267,6 @@ def _building(
 
 def _buildings(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun: np.ndarray) -> list[Polygons]:
     houses = []
-    corridor = max(-plan.left_m, plan.right_m) + 1.5
     for side, kerb in ((-1, -plan.left_m), (1, plan.right_m)):
         arc = path.start_m + 4
         while arc < path.end_m - 30:
@@ -277,18 +276,27 @@ def _buildings(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun
             stretch = 1.0 - float(path.curvature(np.linspace(arc, arc + width, 5)).mean()) * side * offset
             step = width / max(stretch, 0.25)
             house = _building(path, arc + (step - width) / 2, side, offset, width, rng, sun)
-            if stretch > 0.3 and not _on_road(path, house, corridor):
+            if stretch > 0.3 and not _on_road(path, plan, house):
                 houses.append(house)
             arc += step + (0.3 if rng.random() < 0.8 else float(rng.uniform(2, 7)))
     return houses
 
 
-def _on_road(path: StreetPath, thing: Polygons, corridor: float) -> bool:
-    """Whether a thing's foot (its corners and the middles between them) comes nearer to the path than ``corridor``."""
+def _on_road(path: StreetPath, plan: StreetPlan, thing: Polygons) -> bool:
+    """Whether a thing's foot (corners and the middles between them) stands on the road, on any stretch of it."""
     corners = thing.corners[:, :4, [0, 2]].reshape(-1, 2).astype(np.float64)
     spots = np.unique(np.round(np.concatenate([corners, 0.5 * (corners + np.roll(corners, 1, axis=0))]), 1), axis=0)
-    line = path.points_xz[::2]
-    return bool((np.linalg.norm(line[:, None] - spots[None], axis=-1) < corridor).any())
+    return not _beside_road(path, plan, spots, margin_m=0.9)
+
+
+def _beside_road(path: StreetPath, plan: StreetPlan, spots_xz: np.ndarray, *, margin_m: float) -> bool:
+    """Whether all spots (n, 2) lie outside the kerbs of every stretch of the road, by a margin."""
+    line, heading = path.points_xz[::2], path.heading[::2]
+    offset = spots_xz[:, None] - line
+    lateral = offset[..., 0] * np.cos(heading) - offset[..., 1] * np.sin(heading)
+    along = offset[..., 0] * np.sin(heading) + offset[..., 1] * np.cos(heading)
+    on_road = (np.abs(along) < 1.0) & (lateral > plan.left_m - margin_m) & (lateral < plan.right_m + margin_m)
+    return not on_road.any()
 
 
 def _frontal_wall(path: StreetPath) -> Polygons:
@@ -334,7 +342,7 @@ def _prism(
 
 def _blob(centre: np.ndarray, radius: float, rng: np.random.Generator, sun: np.ndarray, green: np.ndarray) -> Polygons:
     """A crown: a ball of triangles with shades of leaf, slightly out of round."""
-    rows, around = 6, 11
+    rows, around = 5, 9
     polar = np.linspace(0, np.pi, rows + 1)
     turn = np.arange(around) * 2 * np.pi / around
     nodes = np.stack([
@@ -395,7 +403,6 @@ def _lamp(spot: np.ndarray, to_road: np.ndarray, sun: np.ndarray) -> Polygons:
 def _furniture(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun: np.ndarray) -> list[Polygons]:
     """Trees and lamps along both kerbs, never on another stretch of the road."""
     things = []
-    corridor = min(-plan.left_m, plan.right_m) + 0.2
     for side, kerb in ((-1, -plan.left_m), (1, plan.right_m)):
         arc = path.start_m + 6 + float(rng.uniform(0, 8))
         while arc < path.end_m - 10:
@@ -404,14 +411,10 @@ def _furniture(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun
             right = np.array([np.cos(heading), 0.0, -np.sin(heading)])
             thing = _lamp(spot, -side * right, sun) if lamp else _tree(spot, rng, sun)
             bends = float(path.curvature(np.array(arc))) * side
-            if bends < 0.5 / kerb and _clear_of_road(path, spot, corridor):
+            if bends < 0.5 / kerb and _beside_road(path, plan, spot[None, [0, 2]], margin_m=0.2):
                 things.append(thing)
             arc += float(rng.uniform(9, 17))
     return things
-
-
-def _clear_of_road(path: StreetPath, spot: np.ndarray, corridor: float) -> bool:
-    return bool((np.linalg.norm(path.points_xz[::2] - spot[[0, 2]], axis=1) > corridor).all())
 
 
 def facing(polygons: Polygons, eye: np.ndarray) -> np.ndarray:
