@@ -1,10 +1,16 @@
 """Synthetic clips with the interface of ``dataset.loader.Sample``, and a tiny cached job, for the training tests."""
 
+import multiprocessing
+import os
+import socket
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+import torch
 
 from labeling.labels import Keypoints
 from training.config import TrainConfig, load_config
@@ -89,3 +95,53 @@ def tiny_config(stage: Any, **overrides: Any) -> TrainConfig:
     for key, value in overrides.items():
         tree[key] = {**tree.get(key, {}), **value} if isinstance(value, dict) else value
     return load_config("tiny", stage=stage, overrides=tree)
+
+
+def in_children(count: int, body: Callable[[int], Any], *, timeout_s: float = 120) -> list[Any]:
+    """Results of ``body(rank)`` in forked processes that see each other as torchrun's do; None for the killed.
+
+    Forked and not spawned: importing the libraries takes longer than the tests.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    context = multiprocessing.get_context("fork")
+    results = context.Queue()
+
+    def run(rank: int) -> None:
+        from accelerate.state import AcceleratorState, PartialState
+
+        for state in (AcceleratorState, PartialState):
+            state._reset_state()
+        if count > 1:
+            os.environ |= {
+                "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count),
+                "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "ACCELERATE_USE_CPU": "true",
+            }  # fmt: skip
+        torch.set_num_threads(1)
+        results.put((rank, body(rank)))
+
+    children = [context.Process(target=run, args=(rank,)) for rank in range(count)]
+    for child in children:
+        child.start()
+    found: dict[int, Any] = {}
+    for child in children:
+        child.join(timeout_s)
+        if child.is_alive():
+            child.kill()
+        while not results.empty():
+            rank, value = results.get()
+            found[rank] = value
+    return [found.get(rank) for rank in range(count)]
+
+
+@pytest.fixture(scope="session")
+def tiny_job(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A job with cached tiny latents, made once; read it, do not write to it."""
+    return cached_job(tmp_path_factory.mktemp("tiny_job"))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> None:
+    """Small tensors are slower on two threads than on one."""
+    torch.set_num_threads(1)

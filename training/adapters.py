@@ -18,10 +18,10 @@ import torch
 from peft import LoraConfig, inject_adapter_in_model
 from peft.tuners.tuners_utils import BaseTunerLayer
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
 from labeling.errors import ModelError
 from training.config import AdapterConfig
+from training.weights import tensor_bytes
 
 DIFFUSERS_METADATA, OUR_METADATA = "lora_adapter_metadata", "animatic"
 EXTRA_PREFIX = "extra."
@@ -156,7 +156,7 @@ def adapter_bytes(
         DIFFUSERS_METADATA: json.dumps({f"{prefix}.{key}": value for key, value in settings.items()}, sort_keys=True),
         OUR_METADATA: json.dumps(dict(about), sort_keys=True),
     }
-    return save(tensors, metadata=metadata)
+    return tensor_bytes(tensors, metadata=metadata)
 
 
 def read_adapter(path: Path) -> AdapterFile:

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save
 
 from dataset.receipts import digest, hashed_share, storage_errors, sync_folder
 from labeling.camera import Intrinsics
@@ -36,6 +35,7 @@ from training.latent_store import (
     text_path,
 )
 from training.stages import EGO, IMAGE, OBJECTS, RGB
+from training.weights import tensor_bytes
 
 CODE_VERSION = 1
 """Raised whenever the same clip would give other latents."""
@@ -237,7 +237,7 @@ def _write_clip(
     object_variants: int,
 ) -> ClipRecord:  # fmt: skip
     path = folder / "clips" / sample.key.rpartition("_")[0] / f"{sample.key}.safetensors"
-    data = save(dict(tensors), metadata={"key": sample.key})
+    data = tensor_bytes(tensors, metadata={"key": sample.key})
     write_whole(path, data)
     return ClipRecord(
         key=sample.key, split=split, caption=sample.caption, file=str(path.relative_to(folder)), size=len(data),
@@ -250,7 +250,7 @@ def _cache_texts(folder: Path, captions: Sequence[str], backbone: Backbone) -> N
         path = text_path(folder, caption)
         if not path.is_file():
             tokens = backbone.encode_text([caption])[0].tokens_LD.to(getattr(torch, backbone.config.latent_dtype))
-            write_whole(path, save({"tokens": tokens.contiguous()}, metadata={"caption": caption}))
+            write_whole(path, tensor_bytes({"tokens": tokens.contiguous()}, metadata={"caption": caption}))
 
 
 def write_whole(path: Path, data: bytes) -> None:

@@ -180,14 +180,16 @@ class LtxBackbone:
     ) -> tuple[torch.Tensor, TokenSequence]:
         """The network's v over the target's tokens, (B, N_target, C), and the sequence it was fed."""
         sequence = assemble_tokens(inputs, noisy_BCFHW, sigma_B=sigma_B, geometry=self.geometry, convention=convention)
-        predicted = self.denoiser(
-            hidden_states=sequence.hidden_BNC.to(self.dtype),
-            encoder_hidden_states=inputs.text_BLD.to(self.dtype),
-            timestep=sequence.timestep_BN,
-            encoder_attention_mask=inputs.text_mask_BL.to(self.dtype),
-            video_coords=sequence.coordinates_B3N,
-            return_dict=False,
-        )[0]
+        # Autocast, in training and in sampling alike: the float32 adapters multiply in the base's bfloat16.
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype == torch.bfloat16):
+            predicted = self.denoiser(
+                hidden_states=sequence.hidden_BNC.to(self.dtype),
+                encoder_hidden_states=inputs.text_BLD.to(self.dtype),
+                timestep=sequence.timestep_BN,
+                encoder_attention_mask=inputs.text_mask_BL.to(self.dtype),
+                video_coords=sequence.coordinates_B3N,
+                return_dict=False,
+            )[0]
         return predicted[:, sequence.target_start :], sequence
 
     def losses(

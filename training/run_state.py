@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file
 
 from labeling.errors import DataError
 from training.adapters import adapter_bytes, put_adapter, read_adapter
 from training.config import TrainConfig
+from training.weights import tensor_bytes
 
 ADAPTER, OPTIMISER, STATE = "adapter.safetensors", "optimiser.safetensors", "state.json"
 _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
@@ -50,7 +51,7 @@ def pack_state(
     about = {"stage": config.stage, "step": state.step, "frames": frames, "config": config.model_dump(mode="json")}
     return {
         ADAPTER: adapter_bytes(denoiser, config.stage, config.adapter, about=about, prefix=prefix),
-        OPTIMISER: save(_moments(optimiser, names)),
+        OPTIMISER: tensor_bytes(_moments(optimiser, names)),
         STATE: json.dumps(
             {
                 "step": state.step, "loader": state.loader, "loader_start": state.loader_start,

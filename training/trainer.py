@@ -233,11 +233,10 @@ class Trainer:
         # Dropout inside the network is keyed as well: by step and clips, not by process.
         torch.manual_seed(keyed_seed(config.seed, self.step, *batch.keys, "network"))
         sigma_B = self.backbone.sigma_from_normal(batch.normal_B, target_shape=batch.inputs.target_shape)
-        with self.accelerator.autocast():
-            losses_B = self.backbone.losses(
-                batch.inputs.to(device), batch.target_BCFHW.to(device), noise_BCFHW=batch.noise_BCFHW.to(device),
-                sigma_B=sigma_B.to(device),
-            )  # fmt: skip
+        losses_B = self.backbone.losses(
+            batch.inputs.to(device), batch.target_BCFHW.to(device), noise_BCFHW=batch.noise_BCFHW.to(device),
+            sigma_B=sigma_B.to(device),
+        )  # fmt: skip
         loss = losses_B.sum() / config.optimiser.global_batch
         loss.backward()
         return loss.detach()
@@ -272,10 +271,7 @@ class Trainer:
 
     def _videos(self) -> None:
         if self.accelerator.is_main_process:
-            write_validation_videos(
-                self.backbone, self.items, self.store, self.config, out=self.out, step=self.step,
-                autocast=lambda: self.accelerator.autocast(),
-            )  # fmt: skip
+            write_validation_videos(self.backbone, self.items, self.store, self.config, out=self.out, step=self.step)
         self.accelerator.wait_for_everyone()
 
 
@@ -301,10 +297,10 @@ def _accelerator(config: TrainConfig, out: Path) -> Accelerator:
         raise ConfigError(
             f"trackers {', '.join(unknown)} are not known to accelerate; choose of {', '.join(sorted(known))}"
         )
-    # Sampling and the loss use their own precision switches; autocast only where the base is bfloat16.
+    # Precision is the backbone's affair: accelerate would fix it for the whole process, and two runs may differ.
     accelerator = Accelerator(
-        mixed_precision="bf16" if config.backbone.dtype == "bfloat16" else "no", log_with=list(config.trackers) or None,
-        project_dir=str(out), cpu=not torch.cuda.is_available(),
+        mixed_precision="no", log_with=list(config.trackers) or None, project_dir=str(out),
+        cpu=not torch.cuda.is_available(),
     )  # fmt: skip
     if config.trackers:
         accelerator.init_trackers("logs", config={"name": config.name, "stage": config.stage, "seed": config.seed})

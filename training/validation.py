@@ -1,6 +1,5 @@
 """Held-out loss at fixed noise, so that curves compare, and videos of fixed clips, so that eyes can."""
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 
@@ -36,7 +35,7 @@ def held_out_losses(
     if not keys:
         return {}
     sums = torch.zeros(len(config.validation.sigmas), device=accelerator.device)
-    with _Evaluating(backbone.denoiser), accelerator.autocast():
+    with _Evaluating(backbone.denoiser):
         for key in keys[accelerator.process_index :: accelerator.num_processes]:
             item = items.item(key, "held-out", held_out=True)
             for place, share in enumerate(config.validation.sigmas):
@@ -64,9 +63,8 @@ class _Evaluating(AbstractContextManager):
 
 
 def write_validation_videos(
-    backbone: Backbone, items: TrainingItems, store: LatentStore, config: TrainConfig, *, out: Path, step: int,
-    autocast: Callable[[], AbstractContextManager],
-) -> list[Path]:  # fmt: skip
+    backbone: Backbone, items: TrainingItems, store: LatentStore, config: TrainConfig, *, out: Path, step: int
+) -> list[Path]:
     """Sample the first held-out clips (training clips where none is held out) and show truth beside sample.
 
     Returns:
@@ -78,7 +76,7 @@ def write_validation_videos(
     for key in keys:
         item = items.item(key, "held-out", held_out=True)
         shape = tuple(item.target_BCFHW.shape)
-        with _Evaluating(backbone.denoiser), autocast():
+        with _Evaluating(backbone.denoiser):
             latents = backbone.sample(
                 item.inputs.to(backbone.device), noise_BCFHW=keyed_normal(shape, config.seed, "video", key),
                 empty_text=store.text(""), settings=settings,

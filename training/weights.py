@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import save
 
 from labeling.errors import ModelError
 
+_HOW_IT_WAS_LOADED = ("dtype", "torch_dtype", "architectures")
 _ADVICE = "give a local diffusers folder, a .safetensors file, or a hub id that this machine can reach"
 
 
@@ -56,6 +58,22 @@ def load_text_encoder(source: str, *, dtype: torch.dtype, single_file: bool = Fa
     return tokenizer, encoder
 
 
+def tensor_bytes(tensors: Mapping[str, torch.Tensor], *, metadata: Mapping[str, str] | None = None) -> bytes:
+    """A safetensors file; the same tensors and metadata give the same bytes.
+
+    The library writes metadata in the order of a hash map, which changes from call to call: the header is put in order.
+    """
+    data = save(dict(tensors), metadata=dict(metadata) if metadata else None)
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    if "__metadata__" in header:
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    # Tensors start at a multiple of 8, as the format asks.
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + data[8 + length :]
+
+
 def digest_tensors(tensors: Mapping[str, torch.Tensor], *, extra: Any = None) -> str:
     """sha256 over names, types, shapes and bytes of tensors, and over ``extra`` as JSON."""
     digest = hashlib.sha256(json.dumps(extra, sort_keys=True, default=str).encode())
@@ -70,7 +88,11 @@ def digest_module(module: torch.nn.Module, *, extra: Mapping[str, Any] | None = 
     """sha256 of a network's weights and its configuration; where it was loaded from does not count."""
     config = getattr(module, "config", {})
     settings = config.to_dict() if hasattr(config, "to_dict") else dict(config)
-    settings = {key: value for key, value in settings.items() if not key.startswith("_") and "version" not in key}
+    settings = {
+        key: value
+        for key, value in settings.items()
+        if not key.startswith("_") and "version" not in key and key not in _HOW_IT_WAS_LOADED
+    }
     return digest_tensors(module.state_dict(), extra={"config": settings, **(extra or {})})
 
 

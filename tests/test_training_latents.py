@@ -1,0 +1,218 @@
+"""Latents: fingerprinted, resumable, by part, from labels and not from decoded skeletons."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from training_fixtures import (  # noqa: F401
+    HEIGHT,
+    PICTURE,
+    WIDTH,
+    FakeSample,
+    fake_datasets,
+    one_thread,
+    tiny_config,
+    tiny_job,
+)
+
+from labeling.errors import ConfigError, DataError
+from labeling.skeleton_video import draw_skeletons
+from training import latents as module
+from training.backbone import load_backbone
+from training.config import backbone_config
+from training.latent_store import LatentStore
+from training.latents import cache_latents, check_store, open_store
+
+
+@pytest.fixture(scope="module")
+def backbone():
+    return load_backbone(backbone_config("tiny", picture=PICTURE))
+
+
+def cache(folder: Path, backbone: Any, **settings: Any):
+    return cache_latents(
+        folder, **{"backbone_name": "tiny", "backbone": backbone, "datasets": fake_datasets(), **settings}
+    )
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Everything but the logs, whose lines may come in another order."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*.safetensors"))}
+
+
+def test_store_holds_every_view_at_the_right_shape(tiny_job) -> None:  # noqa: F811
+    store = open_store(tiny_job, tiny_config("motion").backbone)
+    assert (store.keys("val"), len(store.keys("train"))) == (["other_0", "other_48"], 4)
+    tensors = store.read("street_0", ["rgb", "image", "skeleton", "ego", "objects"])
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    video = (128, 2, HEIGHT // 32, WIDTH // 32)
+    assert shapes == {name: video if name != "image" else (128, 1, 2, 3) for name in tensors}
+    assert not torch.equal(tensors["rgb"], tensors["skeleton"])
+
+
+def test_skeletons_are_rasterised_from_labels(tiny_job, backbone) -> None:  # noqa: F811
+    """``FakeSample.frames`` would give RGB for any suffix: the cached skeleton must be the drawn one."""
+    store = open_store(tiny_job, backbone.config)
+    drawn = np.stack([
+        draw_skeletons([one], width=WIDTH, height=HEIGHT, label_width=WIDTH, label_height=HEIGHT)
+        for one in FakeSample(key="street_0").keypoints()
+    ])  # fmt: skip
+    assert torch.equal(store.read("street_0", ["skeleton"])["skeleton"], backbone.encode_video(drawn))
+
+
+def test_first_latent_frame_is_the_first_frame_alone(backbone) -> None:
+    """The VAE is causal, so what sampling encodes (one frame) is what training saw (the first of many)."""
+    frames = FakeSample(key="street_0").frames("rgb.mp4")
+    torch.testing.assert_close(backbone.encode_video(frames)[:, :1], backbone.encode_video(frames[:1]))
+
+
+def test_other_controls_are_decoded_by_name(tmp_path: Path, backbone) -> None:
+    cache(tmp_path, backbone, controls=["segmentation"], datasets={"train": [FakeSample(key="a_0")]})
+    store = LatentStore(tmp_path / "latents" / "tiny")
+    assert store.read("a_0", ["segmentation"])["segmentation"].shape == (128, 2, 2, 3)
+    assert bool(store.mask("a_0", "segmentation").all())
+
+
+def test_parts_make_what_one_run_makes(tmp_path: Path, backbone, tiny_job) -> None:  # noqa: F811
+    made = [cache(tmp_path, backbone, part=(index, 3)).made for index in range(3)]
+    assert sum(made) == 6 and max(made) < 6
+    assert contents(tmp_path) == contents(tiny_job)
+
+
+def test_a_stopped_run_goes_on_and_ends_the_same(tmp_path: Path, backbone, tiny_job) -> None:  # noqa: F811
+    def stop_at_three(done: int, _: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cache(tmp_path, backbone, progress=stop_at_three)
+    log = next((tmp_path / "latents" / "tiny").glob("clips-*.jsonl"))
+    log.write_text(log.read_text() + '{"key": "torn')
+    summary = cache(tmp_path, backbone)
+    assert (summary.made, summary.kept) == (3, 3)
+    assert contents(tmp_path) == contents(tiny_job)
+    assert cache(tmp_path, backbone).made == 0
+
+
+def test_a_damaged_clip_and_a_changed_source_are_made_anew(tmp_path: Path, backbone, monkeypatch) -> None:
+    few = {"datasets": fake_datasets(1, 1)}
+    cache(tmp_path, backbone, **few)
+    store = LatentStore(tmp_path / "latents" / "tiny")
+    (store.folder / store.record("street_0").file).write_bytes(b"short")
+    assert cache(tmp_path, backbone, **few).made == 1
+    monkeypatch.setattr(module, "_source_digest", lambda sample: f"new {sample.key}")
+    assert cache(tmp_path, backbone, **few).made == 2
+
+
+def test_captions_are_encoded_once_each(tmp_path: Path, backbone, monkeypatch) -> None:
+    seen: list[str] = []
+    encode = backbone.encode_text
+    monkeypatch.setattr(backbone, "encode_text", lambda captions: seen.extend(captions) or encode(captions))
+    summary = cache(tmp_path, backbone)
+    captions = {sample.caption for split in fake_datasets().values() for sample in split}
+    assert sorted(seen) == sorted({"", *captions})
+    assert summary.captions == len(captions)
+    store = LatentStore(tmp_path / "latents" / "tiny")
+    for caption in captions:
+        assert torch.equal(store.text(caption).tokens_LD, encode([caption])[0].tokens_LD)
+
+
+CHANGES: dict[str, Callable[[Any], dict[str, Any]]] = {
+    "vae": lambda _: {"backbone": load_backbone(backbone_config("tiny", picture=PICTURE, seed=1))},
+    "picture": lambda _: {"backbone": load_backbone(backbone_config("tiny", picture=PICTURE | {"rgb_width": 128}))},
+    "controls": lambda backbone: {"backbone": backbone, "controls": ["hdmap"]},
+    "storage": lambda backbone: {"backbone": backbone, "object_variants": 2},
+}
+
+
+@pytest.mark.parametrize("changed", CHANGES)
+def test_a_stale_cache_is_refused_with_both_fingerprints(tmp_path: Path, backbone, changed: str) -> None:
+    few = {"datasets": fake_datasets(1, 1)}
+    held = cache(tmp_path, backbone, **few)
+    settings = CHANGES[changed](backbone) | few
+    with pytest.raises(DataError, match=f"stale.*changed: .*{changed}") as caught:
+        cache(tmp_path, **{"backbone": backbone, **settings})
+    assert held.fingerprint[:16] in str(caught.value)
+    fresh = cache(tmp_path, **{"backbone": backbone, **settings}, refresh=True)
+    assert fresh.made == 2 and fresh.fingerprint[:16] in str(caught.value)
+
+
+def test_the_trainer_refuses_another_vae_or_size(tiny_job) -> None:  # noqa: F811
+    config = tiny_config("motion").backbone
+    store = open_store(tiny_job, config)
+    check_store(store, config, vae_fingerprint=load_backbone(config).fingerprint_vae())
+    with pytest.raises(DataError, match="changed: vae"):
+        check_store(store, config, vae_fingerprint="0" * 64)
+    with pytest.raises(DataError, match="changed: picture"):
+        check_store(store, backbone_config("tiny"))
+
+
+@pytest.mark.parametrize(
+    ("picture", "frames", "message"),
+    [
+        (PICTURE, 10, "8k\\+1"),
+        (PICTURE | {"rgb_width": 100}, 9, "multiples of 32"),
+        (PICTURE | {"frames": 17}, 9, "17"),
+    ],
+    ids=["10 frames", "100 pixels", "clip too short"],
+)
+def test_sizes_are_checked_before_anything_is_spent(tmp_path: Path, picture, frames: int, message: str) -> None:
+    datasets = {"train": [FakeSample(key="a_0", frames_count=frames)]}
+    with pytest.raises(ConfigError, match=message):
+        cache_latents(tmp_path, backbone_name="tiny", picture=picture, datasets=datasets)
+    assert not list(tmp_path.rglob("*.safetensors"))
+
+
+def test_what_is_absent_is_named(tmp_path: Path, tiny_job) -> None:  # noqa: F811
+    with pytest.raises(DataError, match="animatic cache"):
+        LatentStore(tmp_path)
+    store = open_store(tiny_job, tiny_config("motion").backbone)
+    with pytest.raises(DataError, match="hdmap"):
+        store.read("street_0", ["hdmap"])
+    with pytest.raises(DataError, match="no latents of clip"):
+        store.record("nowhere_0")
+    with pytest.raises(DataError, match="no embedding of caption"):
+        store.text("never seen")
+    copy = tmp_path / "copy"
+    shutil.copytree(store.folder, copy)
+    (copy / store.record("street_0").file).write_bytes(b"\0" * 40)
+    with pytest.raises(DataError, match="cannot be read"):
+        LatentStore(copy).read("street_0", ["rgb"])
+
+
+def test_the_vae_with_timestep_conditioning_decodes_the_same_for_a_seed() -> None:
+    from training.backbone import LatentGeometry
+    from training.ltx import LtxBackbone
+    from training.tiny import tiny_text, tiny_transformer, tiny_vae
+
+    config = backbone_config("tiny", picture=PICTURE)
+    backbone = LtxBackbone(
+        config, geometry=LatentGeometry(channels=128, spatial=32, temporal=8), device="cpu",
+        make_denoiser=tiny_transformer, make_vae=lambda: tiny_vae(timestep_conditioning=True), make_text=tiny_text,
+    )  # fmt: skip
+    latents = backbone.encode_video(FakeSample(key="a_0").frames("rgb.mp4"))
+    videos = [backbone.decode_video(latents, seed=seed) for seed in (1, 1, 2)]
+    assert videos[0].shape == (9, HEIGHT, WIDTH, 3)
+    assert np.array_equal(videos[0], videos[1])
+    assert not np.array_equal(videos[0], videos[2])
+
+
+def test_weights_folder_and_missing_weights(tmp_path: Path) -> None:
+    from labeling.errors import ModelError
+    from training.tiny import tiny_text, tiny_transformer, tiny_vae
+
+    tiny_transformer().save_pretrained(tmp_path / "transformer")
+    tiny_vae().save_pretrained(tmp_path / "vae")
+    tokenizer, encoder = tiny_text()
+    tokenizer.save_pretrained(tmp_path / "tokenizer")
+    encoder.save_pretrained(tmp_path / "text_encoder")
+    told = {"kind": "ltx", "size": "2b", "weights": str(tmp_path), "dtype": "float32", "picture": PICTURE}
+    ours = load_backbone(backbone_config("ltx-2b", **told))
+    assert ours.fingerprint() == load_backbone(backbone_config("tiny")).fingerprint()
+    assert ours.denoiser.config["num_layers"] == 2
+    with pytest.raises(ModelError, match="could not be loaded from"):
+        load_backbone(backbone_config("ltx-2b", **{**told, "weights": str(tmp_path / "none")}), parts=["vae"])

@@ -1,0 +1,335 @@
+"""The trainer: the loss falls, resume is exact, the number of processes changes nothing, and trouble is handled."""
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from training_fixtures import PICTURE, in_children, one_thread, tiny_config, tiny_job  # noqa: F401
+
+from labeling.errors import ConfigError, DataError
+from training.adapters import activate_adapter
+from training.backbone import load_backbone
+from training.batches import StepBatches, TrainingItems, collate
+from training.checkpoints import list_checkpoints, newest_checkpoint, save_checkpoint
+from training.config import TrainConfig
+from training.guards import TrainingError, memory_knobs
+from training.latents import open_store
+from training.run_log import read_metrics
+from training.trainer import Trainer, TrainSummary, train
+
+
+def run(config: TrainConfig, data: Path, out: Path, **settings: Any) -> TrainSummary:
+    summary = train(config, data=data, out=out, quiet=True, **settings)
+    assert isinstance(summary, TrainSummary)
+    return summary
+
+
+def files_of(checkpoint: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(checkpoint.iterdir())}
+
+
+@pytest.mark.parametrize("stage", ["motion", "appearance", "end_to_end"])
+def test_the_loss_falls_and_the_adapter_is_what_was_trained(stage, tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    config = tiny_config(
+        stage, optimiser={"steps": 30}, validation={"loss_every_steps": 15, "sigmas": (0.3, 0.7)},
+        trackers=["tensorboard"],
+    )  # fmt: skip
+    summary = run(config, tiny_job, tmp_path)
+    assert sum(summary.losses[-5:]) < 0.9 * sum(summary.losses[:5])
+    metrics = read_metrics(tmp_path)
+    held_out = [line["held_out/mean"] for line in metrics if "held_out/mean" in line]
+    assert len(held_out) == 2 and held_out[1] < held_out[0]
+    assert [line["loss"] for line in metrics if "loss" in line] == pytest.approx(list(summary.losses))
+    assert list(tmp_path.rglob("events.out.tfevents*")), "TensorBoard was not written"
+    # The adapter file, on a fresh backbone, gives the last held-out loss again.
+    backbone = load_backbone(config.backbone)
+    backbone.load_adapter(summary.adapter, stage)
+    activate_adapter(backbone.denoiser, stage)
+    store = open_store(tiny_job, config.backbone)
+    items = TrainingItems(store, store.keys("train"), config)
+    losses = [
+        backbone.losses(
+            item.inputs, item.target_BCFHW, noise_BCFHW=item.noise_BCFHW, sigma_B=torch.tensor([sigma])
+        ).detach()
+        for item in (items.item(key, "held-out", held_out=True) for key in store.keys("val"))
+        for sigma in (0.3, 0.7)
+    ]
+    assert float(torch.stack(losses).mean()) == pytest.approx(held_out[1], rel=1e-5)
+
+
+def test_kill_9_and_resume_equals_an_undisturbed_run_bit_for_bit(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    config = tiny_config(
+        "motion", optimiser={"steps": 6, "schedule": "cosine"}, checkpoint={"every_steps": 3}, adapter={"dropout": 0.1}
+    )
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+
+    def undisturbed(_: int) -> list[float]:
+        return list(run(config, tiny_job, whole).losses)
+
+    def killed(_: int) -> None:
+        run(
+            config,
+            tiny_job,
+            broken,
+            on_step=lambda step, _: os.kill(os.getpid(), signal.SIGKILL) if step == 5 else None,
+        )
+
+    def resumed(_: int) -> list[float]:
+        summary = run(config, tiny_job, broken)
+        assert summary.started_at == 3
+        return list(summary.losses)
+
+    (losses,) = in_children(1, undisturbed)
+    assert in_children(1, killed) == [None]
+    assert [path.name for path in list_checkpoints(broken / "checkpoints")] == ["step_00000003"]
+    (later,) = in_children(1, resumed)
+    assert later == losses[3:]
+    assert files_of(whole / "checkpoints/step_00000006") == files_of(broken / "checkpoints/step_00000006")
+    assert (whole / "adapter.safetensors").read_bytes() == (broken / "adapter.safetensors").read_bytes()
+    steps = [line["step"] for line in read_metrics(broken)]
+    assert steps == [1, 2, 3, 4, 5, 6]
+
+
+def test_1_2_and_4_processes_have_the_same_losses(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    config = tiny_config("motion", optimiser={"steps": 3, "global_batch": 4, "micro_batch": 2})
+    losses = {}
+    for count in (1, 2, 4):
+        found = in_children(count, lambda _, count=count: list(run(config, tiny_job, tmp_path / str(count)).losses))
+        assert all(one == found[0] for one in found), "processes of one run disagree"
+        losses[count] = found[0]
+    assert losses[2] == pytest.approx(losses[1], rel=1e-5)
+    assert losses[4] == pytest.approx(losses[1], rel=1e-5)
+
+
+def test_accumulation_changes_nothing_but_rounding(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    losses = [
+        run(
+            tiny_config("appearance", optimiser={"global_batch": 4, "micro_batch": size}),
+            tiny_job,
+            tmp_path / str(size),
+        )
+        for size in (1, 3, 4)
+    ]
+    for one in losses[1:]:
+        assert one.losses == pytest.approx(losses[0].losses, rel=1e-5)
+
+
+def test_loader_workers_and_checkpointing_change_nothing(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    plain = run(tiny_config("motion"), tiny_job, tmp_path / "plain")
+    other = run(tiny_config("motion", loader_workers=2, gradient_checkpointing=True), tiny_job, tmp_path / "other")
+    assert other.losses == pytest.approx(plain.losses, rel=1e-6)
+
+
+def test_a_resume_with_other_workers_goes_on_with_the_same_samples(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    config = tiny_config("motion", optimiser={"steps": 4}, checkpoint={"every_steps": 2, "keep": 9})
+    whole = run(config, tiny_job, tmp_path)
+    other = config.model_copy(update={"loader_workers": 1})
+    again = run(other, tiny_job, tmp_path / "again", resume=tmp_path / "checkpoints" / "step_00000002")
+    assert again.losses == whole.losses[2:]
+
+
+def test_ctrl_c_saves_first_and_the_run_goes_on(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    config = tiny_config("motion", checkpoint={"every_steps": 100})
+    whole = run(config, tiny_job, tmp_path / "whole")
+    cut = run(
+        config, tiny_job, tmp_path / "cut",
+        on_step=lambda step, _: os.kill(os.getpid(), signal.SIGINT) if step == 1 else None,
+    )  # fmt: skip
+    assert cut.interrupted and cut.steps == 2
+    rest = run(config, tiny_job, tmp_path / "cut")
+    assert (*cut.losses, *rest.losses) == whole.losses
+
+
+def test_a_loss_that_is_no_number_stops_with_the_last_checkpoint_intact(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    config = tiny_config("motion", checkpoint={"every_steps": 2})
+    backbone = load_backbone(config.backbone)
+    losses = backbone.losses
+    calls = []
+
+    def poisoned(*arguments: Any, **named: Any) -> torch.Tensor:
+        calls.append(1)
+        return losses(*arguments, **named) * (float("nan") if len(calls) > 5 else 1.0)
+
+    backbone.losses = poisoned  # type: ignore[method-assign]
+    with pytest.raises(TrainingError, match="not a number at step"):
+        run(config, tiny_job, tmp_path, backbone=backbone)
+    good = newest_checkpoint(tmp_path / "checkpoints")
+    assert good is not None and good.name == "step_00000002"
+    assert torch.isfinite(torch.tensor(run(config, tiny_job, tmp_path).losses)).all()
+
+
+def test_out_of_memory_says_which_knobs_to_turn_in_order(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    config = tiny_config("motion", adapter={"rank": 128})
+    backbone = load_backbone(config.backbone)
+
+    def full(*_: Any, **__: Any) -> torch.Tensor:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    backbone.losses = full  # type: ignore[method-assign]
+    with pytest.raises(TrainingError, match="micro_batch to 1.*gradient_checkpointing.*rank from 128.*fewer frames"):
+        run(config, tiny_job, tmp_path, backbone=backbone)
+    thrifty = tiny_config("motion", optimiser={"micro_batch": 1}, gradient_checkpointing=True, adapter={"rank": 8})
+    assert not any("micro_batch" in knob or "gradient" in knob or "rank" in knob for knob in memory_knobs(thrifty))
+
+
+def test_torn_checkpoints_are_skipped_with_a_warning_and_the_last_n_are_kept(tmp_path: Path) -> None:
+    for step in range(1, 6):
+        save_checkpoint(tmp_path, step, {"a": bytes(100), "b": bytes([step])}, keep=3)
+    assert [path.name[-1] for path in list_checkpoints(tmp_path)] == ["3", "4", "5"]
+    (tmp_path / "step_00000005" / "a").write_bytes(bytes(99))
+    (tmp_path / "step_00000004" / "b").write_bytes(b"x")
+    with pytest.warns(UserWarning, match="torn checkpoint"):
+        assert newest_checkpoint(tmp_path) == tmp_path / "step_00000003"
+    (tmp_path / "step_00000003" / "manifest.json").unlink()
+    with pytest.warns(UserWarning, match="torn"):
+        assert newest_checkpoint(tmp_path) is None
+
+
+def test_a_save_that_fails_leaves_earlier_checkpoints_whole(tmp_path: Path, monkeypatch) -> None:
+    from labeling.errors import StorageError
+    from training import checkpoints
+
+    save_checkpoint(tmp_path, 1, {"a": b"1"}, keep=1)
+    write = checkpoints._write_synced
+
+    def no_space(path: Path, data: bytes) -> None:
+        if path.name == "manifest.json":
+            raise OSError(28, "No space left on device")
+        write(path, data)
+
+    monkeypatch.setattr(checkpoints, "_write_synced", no_space)
+    with pytest.raises(StorageError):
+        save_checkpoint(tmp_path, 2, {"a": b"2"}, keep=1)
+    assert newest_checkpoint(tmp_path) == tmp_path / "step_00000001"
+    assert [path.name for path in tmp_path.iterdir()] == ["step_00000001"]
+
+
+def test_resume_refuses_other_settings_and_never_refuses_a_used_folder(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    config = tiny_config("motion", checkpoint={"every_steps": 2})
+    run(config, tiny_job, tmp_path)
+    with pytest.raises(ConfigError, match=r"other settings \(seed, optimiser.learning_rate\)"):
+        run(tiny_config("motion", seed=5, optimiser={"learning_rate": 1e-3}), tiny_job, tmp_path)
+    with pytest.raises(ConfigError, match="already has checkpoints"):
+        run(config, tiny_job, tmp_path, resume="never")
+    assert run(config, tiny_job, tmp_path).losses == ()
+
+
+def test_held_out_loss_does_not_depend_on_step_seed_of_order_or_dropout(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    """A learning rate next to nothing: the curve must be flat."""
+    config = tiny_config(
+        "motion", optimiser={"learning_rate": 1e-12}, validation={"loss_every_steps": 1}, adapter={"dropout": 0.5}
+    )
+    run(config, tiny_job, tmp_path)
+    curve = [line["held_out/mean"] for line in read_metrics(tmp_path) if "held_out/mean" in line]
+    assert len(curve) == 4
+    assert max(curve) - min(curve) < 1e-6
+
+
+def test_validation_videos_are_written(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    import cv2
+
+    from labeling.video import frame_count
+
+    config = tiny_config("motion", validation={"videos_every_steps": 2, "sampling_steps": 2})
+    run(config, tiny_job, tmp_path)
+    videos, sheets = (sorted((tmp_path / "validation").glob(f"*.{kind}")) for kind in ("mp4", "png"))
+    assert [path.stem for path in videos] == ["step_00000002_other_0", "step_00000004_other_0"]
+    assert frame_count(videos[0]) == 9
+    sheet = cv2.imread(str(sheets[0]))
+    assert sheet is not None and sheet.shape == (2 * 64, 8 * 96, 3)
+
+
+def test_unknown_trackers_missing_latents_and_empty_splits_are_named(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    with pytest.raises(ConfigError, match="trackers notebook are not known.*tensorboard"):
+        run(tiny_config("motion", trackers=["notebook"]), tiny_job, tmp_path)
+    with pytest.raises(DataError, match="animatic cache"):
+        run(tiny_config("motion"), tmp_path, tmp_path / "out")
+    with pytest.raises(DataError, match="stale.*picture"):
+        run(tiny_config("motion", backbone={"picture": {**PICTURE, "rgb_width": 128}}), tiny_job, tmp_path)
+    only_val = tmp_path / "only_val"
+    from training_fixtures import fake_datasets
+
+    from training.latents import cache_latents
+
+    cache_latents(only_val, backbone_name="tiny", picture=PICTURE, datasets={"val": fake_datasets(0, 1)["val"]})
+    with pytest.raises(DataError, match="no clips for training"):
+        run(tiny_config("motion"), only_val, tmp_path / "out")
+
+
+def test_order_covers_every_clip_each_epoch_and_is_shared_out_without_overlap() -> None:
+    config = tiny_config("motion", optimiser={"steps": 6, "global_batch": 5, "micro_batch": 2})
+    whole = [draw for batch in StepBatches(10, config=config) for draw in batch]
+    assert sorted(draw.index for draw in whole[:10]) == list(range(10))
+    assert [draw.index for draw in whole[:10]] != [draw.index for draw in whole[10:20]]
+    shares = [[d for batch in StepBatches(10, config=config, rank=r, world_size=3) for d in batch] for r in range(3)]
+    for step in range(6):
+        parts = sorted((d.epoch, d.index) for share in shares for d in share if d.step == step)
+        assert parts == sorted((d.epoch, d.index) for d in whole if d.step == step)
+
+
+def test_a_sample_that_comes_twice_in_a_step_is_drawn_twice(tiny_job: Path) -> None:  # noqa: F811
+    config = tiny_config("motion", optimiser={"global_batch": 8, "micro_batch": 8})
+    store = open_store(tiny_job, config.backbone)
+    items = TrainingItems(store, store.keys("train"), config)
+    batch = next(iter(StepBatches(4, config=config)))
+    drawn = [items[draw] for draw in batch if draw.index == 0]
+    assert len(drawn) == 2
+    assert not torch.equal(drawn[0].noise_BCFHW, drawn[1].noise_BCFHW)
+
+
+def test_conditions_come_with_their_own_probabilities_and_together(tiny_job: Path) -> None:  # noqa: F811
+    config = tiny_config(
+        "motion", conditions={"ego_probability": 0.75, "objects_probability": 0.25, "caption_dropout": 0.1}
+    )
+    store = open_store(tiny_job, config.backbone)
+    items = TrainingItems(store, store.keys("train"), config)
+    given = [items.item(store.keys("train")[0], "train", step, 0).inputs for step in range(1500)]
+    names = [frozenset(reference.name for reference in one.references) for one in given]
+    shares = {name: sum(name in one for one in names) / len(names) for name in ("ego", "objects", "image")}
+    assert shares == pytest.approx({"ego": 0.75, "objects": 0.25, "image": 1.0}, abs=0.04)
+    both = sum({"ego", "objects"} <= one for one in names) / len(names)
+    assert both == pytest.approx(0.75 * 0.25, abs=0.03)
+    dropped = sum(int(one.text_mask_BL.sum()) == 1 for one in given) / len(given)
+    assert dropped == pytest.approx(0.1, abs=0.03)
+
+
+def test_batches_hold_one_layout_and_keep_every_sample(tiny_job: Path) -> None:  # noqa: F811
+    config = tiny_config("motion")
+    store = open_store(tiny_job, config.backbone)
+    items = TrainingItems(store, store.keys("train"), config)
+    drawn = [items.item(key, "train", step, 0) for step in range(3) for key in store.keys("train")]
+    batches = collate(drawn)
+    assert len(batches) > 1
+    assert sorted(key for batch in batches for key in batch.keys) == sorted(item.key for item in drawn)
+    for batch in batches:
+        assert len(batch.target_BCFHW) == len(batch.keys) == len(batch.inputs.text_BLD)
+
+
+def test_the_checkpoint_manifest_is_the_last_word(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    run(tiny_config("motion", checkpoint={"every_steps": 4}), tiny_job, tmp_path)
+    folder = tmp_path / "checkpoints" / "step_00000004"
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert set(manifest["files"]) == {"adapter.safetensors", "optimiser.safetensors", "state.json"}
+    assert (tmp_path / "adapter.safetensors").read_bytes() == (folder / "adapter.safetensors").read_bytes()
+
+
+def test_bfloat16_base_trains_float32_adapters(tmp_path: Path) -> None:
+    from training_fixtures import fake_datasets
+
+    from training.config import backbone_config
+    from training.latents import cache_latents
+
+    backbone = load_backbone(backbone_config("tiny", picture=PICTURE, dtype="bfloat16", latent_dtype="bfloat16"))
+    cache_latents(tmp_path, backbone_name="tiny", backbone=backbone, datasets=fake_datasets(2, 0))
+    config = tiny_config("motion", backbone={"dtype": "bfloat16", "latent_dtype": "bfloat16"}, optimiser={"steps": 10})
+    trainer = Trainer(config, data=tmp_path, out=tmp_path / "out", quiet=True)
+    losses = trainer.run().losses
+    assert {one.dtype for one in trainer.parameters} == {torch.float32}
+    assert {state["exp_avg"].dtype for state in trainer.optimiser.state.values()} == {torch.float32}
+    frozen = [one for one in trainer.backbone.denoiser.parameters() if not one.requires_grad]
+    assert {one.dtype for one in frozen} == {torch.bfloat16}
+    assert losses[-1] < losses[0]
