@@ -15,6 +15,7 @@ import numpy as np
 from labeling.errors import DataError
 from labeling.labels import POINT_DETECTED, Keypoints
 from labeling.schemas import keypoint_schema
+from labeling.skeleton_redraw import redrawn_points
 from labeling.skeleton_video import DEFAULT_STYLE, LABEL_HEIGHT, LABEL_WIDTH, SkeletonStyle, dot_edges, style_radii
 
 LEAST_POINTS = 4
@@ -26,8 +27,10 @@ _LEAST_HUE, _LEAST_LIT = 0.4, 0.85
 _OVERSHOOT = 0.25
 _SAMPLES = 13
 _LEAST_UNCLAIMED = 0.5
-_LEAST_DOT, _LEAST_SCORE = 0.5, 1.0
+_LEAST_DOT, _CLEAR_DOT, _LEAST_SCORE = 0.5, 0.8, 1.0
 _ROUNDS = 4
+_LEAST_PIXELS, _MOST_PROPOSALS = 3, 64
+"""A piece of fewer pixels proposes nothing, and a point has no more proposals: noise shall not take minutes."""
 _SEARCH = np.arange(-2.0, 2.01, 0.5)
 
 
@@ -84,17 +87,21 @@ def skeletons_from_frame(
     if table.category != "car":
         raise DataError(f"only cars are read back from colours, not {schema}; give car66 or car24")
     height, width = picture.shape[:2]
-    _, dot_radius = style_radii(style.car_line, style.car_dot, width=width, height=height)
+    radii = style_radii(style.car_line, style.car_dot, width=width, height=height)
     parts = edge_of_pixels(picture, edge_count=len(table.edges))
-    proposals = _propose(parts, schema, dot_radius)
-    evidence = _evidence(parts, picture.max(axis=2) > _DARKEST // 2, proposals, table.edges, dot_radius)
+    proposals = _propose(parts, schema, radii[1])
+    evidence = _evidence(parts, picture.max(axis=2) > _DARKEST // 2, proposals, table.edges, radii[1])
     cars = _unclaimed(_join(proposals, evidence, table.edges), parts, proposals, table.edges)
     scale = np.array([label_width / width, label_height / height])
     labels = []
     for car in sorted(cars, key=lambda car: sorted(car.items())):
+        places = {point: proposals[point].places[number] for point, number in car.items()}
+        unsure = [point for point, number in sorted(car.items()) if proposals[point].dots[number] < _CLEAR_DOT]
+        places = redrawn_points(parts, places, unsure, schema=schema, radii=radii)
+        if len(places) < LEAST_POINTS:
+            continue
         points = np.zeros((table.point_count, 3))
-        for point, number in car.items():
-            place = proposals[point].places[number]
+        for point, place in places.items():
             points[point] = *((place + 0.5) * scale - 0.5), 1.0
         labels.append(_label(points, schema, frame))
     return labels
@@ -133,13 +140,19 @@ def _propose(parts: np.ndarray, schema: str, dot_radius: float) -> list[_Proposa
 
 
 def _pieces(mask: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Middle (2,), axis (2,) and half length of each connected piece of a mask, along its principal axis."""
-    count, numbers = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    """Middle (2,), axis (2,) and half length of the largest connected pieces of a mask, along their principal axes."""
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    crop = mask[top : top + height, left : left + width].astype(np.uint8)
+    if not crop.size:
+        return []
+    _, numbers, stats, _ = cv2.connectedComponentsWithStats(crop, connectivity=8)
+    area = stats[1:, cv2.CC_STAT_AREA]
+    largest = 1 + np.argsort(-area, kind="stable")[:_MOST_PROPOSALS]
     rows, columns = np.nonzero(numbers)
     piece = numbers[rows, columns]
-    all_pixels = np.column_stack([columns, rows]).astype(np.float64)
+    all_pixels = np.column_stack([columns + left, rows + top]).astype(np.float64)
     pieces = []
-    for number in range(1, count):
+    for number in largest[area[largest - 1] >= _LEAST_PIXELS]:
         pixels = all_pixels[piece == number]
         centred = pixels - pixels.mean(axis=0)
         axis = np.linalg.eigh(centred.T @ centred)[1][:, 1]
@@ -174,8 +187,9 @@ def _on_dots(parts: np.ndarray, edge: int, proposed: tuple[np.ndarray, np.ndarra
         key = same[0] if same else (float(place[0]), float(place[1]))
         before = kept.get(key, (0.0, 0.0))
         kept[key] = (before[0] + votes, max(before[1], seen))
-    votes, dots = np.array(list(kept.values())).reshape(-1, 2).T
-    return _Proposals(places=np.array(list(kept)).reshape(-1, 2), votes=votes, dots=dots)
+    best = sorted(kept.items(), key=lambda one: (-one[1][1] - 0.1 * one[1][0], one[0]))[:_MOST_PROPOSALS]
+    places, numbers = (np.array([one[i] for one in best]).reshape(-1, 2) for i in (0, 1))
+    return _Proposals(places=places, votes=numbers[:, 0], dots=numbers[:, 1])
 
 
 def _evidence(
