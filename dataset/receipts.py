@@ -22,7 +22,7 @@ from labeling.errors import DataError, StorageError
 State = Literal["done", "dropped", "failed"]
 
 _STORAGE_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.ENOTDIR, errno.EACCES, errno.EPERM,
-                   errno.EIO, errno.ESTALE, errno.ENAMETOOLONG}  # fmt: skip
+                   errno.EIO, errno.ESTALE, errno.ENAMETOOLONG, errno.EEXIST, errno.EISDIR}  # fmt: skip
 _HASH_BLOCK = 1 << 20
 
 

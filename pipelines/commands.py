@@ -15,7 +15,7 @@ from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, w
 from pipelines.console import ConsoleReporter, print_failures
 from pipelines.engine import Engine
 from pipelines.job import Job, find_videos, open_job, open_or_create
-from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages
+from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
 from pipelines.layout import SELECTION
 from pipelines.stage import COMMAND_STAGES, Part, parse_part
 from pipelines.stages_select import NO_DETECTOR, job_extractors
@@ -49,6 +49,7 @@ def run_label(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
     job = prepare_job(videos, out, options)
     check_extractors(job, reporter)
     reports = run_job(job, ALL_STAGES, options, reporter)
+    sweep_outdated(job)
     return _finish(job, reports, reporter)
 
 

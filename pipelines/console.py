@@ -15,7 +15,8 @@ from pipelines.label import StageReport
 
 def make_console(*, stderr: bool = False) -> Console:
     """A console that never wraps what a script may want to read."""
-    return Console(stderr=stderr, highlight=False, soft_wrap=True)
+    console = Console(stderr=stderr, highlight=False, soft_wrap=True)
+    return console if console.is_terminal else Console(stderr=stderr, highlight=False, soft_wrap=True, width=160)
 
 
 class ConsoleReporter:

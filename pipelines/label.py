@@ -152,3 +152,24 @@ def _progress(root: Path) -> tuple[tuple[str, int], ...]:
     """Sizes of all receipt logs: they grow while any part lives."""
     logs = sorted((root / "receipts").glob("*/*.jsonl"))
     return tuple((str(log.relative_to(root)), log.stat().st_size) for log in logs)
+
+
+def sweep_outdated(job: Job) -> list[Path]:
+    """Remove runs' and clips' files that no plan names any more; what was removed.
+
+    A selection that keeps less leaves runs behind. Nothing is removed while anything is unsettled or has failed. The
+    receipts stay: a file that is missing is made again when it is wanted again.
+    """
+    if any(job.pending(stage) or _failures(job, stage) for stage in STAGES):
+        return []
+    wanted = {job.root / output for stage in STAGES for item in job.plan(stage) for output in item.outputs}
+    folders = [path for path in (job.root / "videos").glob("*") if path.is_dir()]
+    found = [path for folder in folders for path in (*folder.glob("run_*"), *folder.glob("clips/*")) if path.is_file()]
+    outdated = [path for path in sorted(found) if path not in wanted]
+    for path in outdated:
+        path.unlink(missing_ok=True)
+    return outdated
+
+
+def _failures(job: Job, stage: str) -> list[Receipt]:
+    return [receipt for receipt in job.settled(stage).values() if receipt.state == "failed"]
