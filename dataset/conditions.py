@@ -30,7 +30,7 @@ levels of sigma (noise), a share of the picture's height or area (bonnet, overla
 (brightness_ramp), a constant rate factor (h264)."""
 
 _NIGHT_NOISE = 6.0
-_LAMP_LEVEL = 222.0
+_LAMP_LEVEL = 228.0
 _FPS = 24
 _RAMP_FRAMES = 120
 
@@ -110,14 +110,15 @@ def _dusk(rgb: np.ndarray, amount: float, seed: int, frame: int, rng: np.random.
 
 
 def _night(rgb: np.ndarray, amount: float, seed: int, frame: int, rng: np.random.Generator) -> np.ndarray:
-    """A low gain, more in the cone of the own headlights; what was bright near the road shines; noise."""
+    """A low gain, more in the cone of the own headlights; lamps in the picture shine; noise."""
     height, width = rgb.shape[:2]
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
     across, down = (x - width / 2) / width, y / height - 0.5
     cone = np.exp(-((across / (0.10 + 0.5 * np.maximum(down, 0.0))) ** 2)) * np.clip(down * 9, 0, 1) * 0.3
     dark = rgb * (amount + cone)[..., None] * np.array([0.94, 0.97, 1.06], np.float32)
-    lamps = np.clip(rgb.max(axis=2).astype(np.float32) - _LAMP_LEVEL, 0, 33) * (7.0 / 33 * 30)
-    lamps[: int(height * 0.28)] = 0.0  # Sky is no lamp.
+    red, blue = rgb[..., 0].astype(np.float32), rgb[..., 2].astype(np.float32)
+    # Lamps are bright and warm; clouds and white paint are bright and cold.
+    lamps = np.clip(red - _LAMP_LEVEL, 0, 10) * np.clip(red - blue - 8, 0, 4) * (210.0 / 40)
     halo = cv2.GaussianBlur(lamps, (0, 0), max(1.0, width / 130))
     glow = (np.minimum(lamps, 170) + 1.1 * halo)[..., None] * np.array([1.0, 0.92, 0.74], np.float32)
     return _bytes(dark + glow * 0.6 + rng.normal(0, _NIGHT_NOISE, rgb.shape).astype(np.float32))

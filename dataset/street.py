@@ -5,11 +5,13 @@ The embedded default data of the project, and the exact-truth world for its test
 """
 
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
+from dataset.conditions import Condition, apply_condition
 from dataset.street_actors import Actor, car_actor_now, ground_shadows, person_actor_now
 from dataset.street_drives import Drive, StreetPath, drive_along, drive_given, path_from_bends, speed_profile, wandering
 from dataset.street_labels import StreetObject, label_actors, label_lanes
@@ -20,6 +22,7 @@ from dataset.street_traffic import Density, cast_street
 from labeling.camera import Intrinsics, Trajectory, invert, rebased_trajectory
 from labeling.errors import ConfigError
 from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
+from labeling.video import VideoWriter
 
 Scenario = Literal[
     "drive", "traffic", "parked", "empty", "crossing", "still", "turn", "reverse", "wall", "road_only", "stop_and_go",
@@ -315,16 +318,15 @@ def _record(frame: int, thing: StreetObject) -> Keypoints:
     )  # fmt: skip
 
 
-def write_street_video(config: StreetConfig, path: Path, *, condition: str | None = None) -> None:
-    """Render all frames of a street into an MP4; ``condition`` names a picture condition of ``dataset.conditions``.
+def write_street_video(config: StreetConfig, path: Path, *, condition: Condition = "clean") -> None:
+    """Render all frames of a street into an H.264 MP4 at ``config.fps``, in a picture condition.
 
     Raises:
-        ConfigError: an unknown condition.
+        ConfigError: an unknown condition, odd sides.
         StorageError: the file cannot be written.
     """
-    from labeling.video import VideoWriter
-
     street = Street(config)
-    with VideoWriter(path, width=config.width, height=config.height, fps=config.fps) as writer:
+    rate = Fraction(config.fps).limit_denominator(1001)
+    with VideoWriter(path, width=config.width, height=config.height, fps=rate) as writer:
         for i in range(config.frames):
-            writer.write(street.render(i).rgb)
+            writer.write(apply_condition(street.render(i).rgb, condition, seed=config.seed, frame=i))

@@ -318,8 +318,8 @@ def _paint(
             continue
         spans[n, 0], spans[n, 1] = 1e9, 0.0
         for k in range(left):
-            spans[n, 0] = min(spans[n, 0], 1.0 / cam[k, 2])
-            spans[n, 1] = max(spans[n, 1], 1.0 / cam[k, 2])
+            spans[n, 0] = min(spans[n, 0], 0.98 / cam[k, 2])
+            spans[n, 1] = max(spans[n, 1], 1.02 / cam[k, 2])
         if texture[n] >= 0:
             _texture_rows(gradient[n], rotation, camera, depth_rows[n], rows[n])
         for y in range(y0, y1 + 1):
