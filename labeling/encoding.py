@@ -142,7 +142,8 @@ class VideoWriter:
         """Give up and take the unfinished file away."""
         with contextlib.suppress(Exception):
             self._container.close()
-        self._path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self._path.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         return self
@@ -178,7 +179,8 @@ def copy_packets(source: Path, out: Path, *, start: int, end: int) -> None:
                 _mux_copy(packets, stream, out, shift)
             check_written(out, end - start)
         except BaseException:
-            out.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                out.unlink(missing_ok=True)
             raise
 
 
