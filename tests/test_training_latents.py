@@ -185,15 +185,12 @@ def test_what_is_absent_is_named(tmp_path: Path, tiny_job) -> None:  # noqa: F81
 
 
 def test_the_vae_with_timestep_conditioning_decodes_the_same_for_a_seed() -> None:
-    from training.backbone import LatentGeometry
     from training.ltx import LtxBackbone
-    from training.tiny import tiny_text, tiny_transformer, tiny_vae
+    from training.tiny import tiny_ltx_makers, tiny_vae
 
     config = backbone_config("tiny", picture=PICTURE)
-    backbone = LtxBackbone(
-        config, geometry=LatentGeometry(channels=128, spatial=32, temporal=8), device="cpu",
-        make_denoiser=tiny_transformer, make_vae=lambda: tiny_vae(timestep_conditioning=True), make_text=tiny_text,
-    )  # fmt: skip
+    makers = tiny_ltx_makers(config) | {"vae": lambda: tiny_vae(timestep_conditioning=True)}
+    backbone = LtxBackbone(config, device="cpu", makers=makers)
     latents = backbone.encode_video(FakeSample(key="a_0").frames("rgb.mp4"))
     videos = [backbone.decode_video(latents, seed=seed) for seed in (1, 1, 2)]
     assert videos[0].shape == (9, HEIGHT, WIDTH, 3)

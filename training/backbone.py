@@ -26,6 +26,8 @@ class LatentGeometry:
     """Pixels per latent cell, each way."""
     temporal: int
     """Frames per latent frame after the first; 1 where every frame is its own."""
+    multiple: int = 0
+    """Pixels that sizes must be a multiple of, where the network halves its latents further; 0 means ``spatial``."""
 
     def latent_shape(self, *, frames: int, height: int, width: int) -> tuple[int, int, int, int]:
         """(C, F, H, W) of a video.
@@ -39,11 +41,11 @@ class LatentGeometry:
                 f"{frames} frames do not fit the backbone: it takes {self.temporal}k+1, such as {lower} or "
                 f"{lower + self.temporal} (others would silently lose frames); set picture.frames or the clip length"
             )
-        if height % self.spatial or width % self.spatial or min(height, width) < self.spatial:
+        step = self.multiple or self.spatial
+        if height % step or width % step or min(height, width) < step:
             raise ConfigError(
-                f"a picture of {width}x{height} does not fit the backbone: both must be multiples of {self.spatial}; "
-                f"try {max(1, round(width / self.spatial)) * self.spatial}x"
-                f"{max(1, round(height / self.spatial)) * self.spatial}"
+                f"a picture of {width}x{height} does not fit the backbone: both must be multiples of {step}; try "
+                f"{max(1, round(width / step)) * step}x{max(1, round(height / step)) * step}"
             )
         latent_frames = (frames - 1) // self.temporal + 1
         return self.channels, latent_frames, height // self.spatial, width // self.spatial
@@ -82,12 +84,16 @@ class StageInputs:
     first_frame_BCFHW: torch.Tensor
     """(B, C, 1, H, W): the target's first latent frame, clean."""
     references: tuple[Reference, ...]
+    slots: tuple[str, ...]
+    """Names of all references that the stage may be given, present or not."""
     text_BLD: torch.Tensor
     """Padded with zeros."""
     text_mask_BL: torch.Tensor
     """Bool, True where a token is."""
     fps: float
     """Video frames per second."""
+    image_B1D: torch.Tensor | None = None
+    """The first RGB frame's embedding, where the backbone has an image encoder."""
 
     @property
     def layout(self) -> tuple:
@@ -98,7 +104,7 @@ class StageInputs:
     def to(self, device: torch.device) -> "StageInputs":
         """The same inputs on a device."""
         return StageInputs(
-            target_shape=self.target_shape, first_frame_BCFHW=self.first_frame_BCFHW.to(device),
+            target_shape=self.target_shape, first_frame_BCFHW=self.first_frame_BCFHW.to(device), slots=self.slots,
             references=tuple(
                 Reference(
                     name=r.name, latents_BCFHW=r.latents_BCFHW.to(device), first_latent_frame=r.first_latent_frame
@@ -106,6 +112,7 @@ class StageInputs:
                 for r in self.references
             ),
             text_BLD=self.text_BLD.to(device), text_mask_BL=self.text_mask_BL.to(device), fps=self.fps,
+            image_B1D=None if self.image_B1D is None else self.image_B1D.to(device),
         )  # fmt: skip
 
 
@@ -162,6 +169,10 @@ class Backbone(Protocol):
         """One embedding per caption, on the CPU."""
         ...
 
+    def encode_image(self, frame_HWC: np.ndarray) -> torch.Tensor | None:
+        """(1, D) embedding of a (H, W, 3) uint8 RGB picture, on the CPU; None without an image encoder."""
+        ...
+
     def fingerprint(self) -> dict[str, str]:
         """sha256 of the weights and settings that latents and text embeddings depend on, by part."""
         ...
@@ -197,6 +208,24 @@ def pad_text(embeddings: Sequence[TextEmbedding], *, length: int) -> tuple[torch
         text_BLD[row, :count] = embedding.tokens_LD[:count]
         mask_BL[row, :count] = True
     return text_BLD, mask_BL
+
+
+def with_empty_text(inputs: StageInputs, empty_text: TextEmbedding) -> StageInputs:
+    """The batch twice, for guidance: first with the empty caption, then with its own."""
+    batch, length = inputs.text_mask_BL.shape
+    empty_BLD, empty_mask = pad_text([empty_text] * batch, length=length)
+    references = tuple(
+        Reference(
+            name=r.name, latents_BCFHW=r.latents_BCFHW.repeat(2, 1, 1, 1, 1), first_latent_frame=r.first_latent_frame
+        )
+        for r in inputs.references
+    )
+    return StageInputs(
+        target_shape=inputs.target_shape, first_frame_BCFHW=inputs.first_frame_BCFHW.repeat(2, 1, 1, 1, 1),
+        references=references, slots=inputs.slots, text_BLD=torch.cat([empty_BLD.to(inputs.text_BLD), inputs.text_BLD]),
+        text_mask_BL=torch.cat([empty_mask.to(inputs.text_mask_BL.device), inputs.text_mask_BL]), fps=inputs.fps,
+        image_B1D=None if inputs.image_B1D is None else inputs.image_B1D.repeat(2, 1, 1),
+    )  # fmt: skip
 
 
 def load_backbone(config: BackboneConfig, *, device: str | torch.device = "cpu", parts: Sequence[str] = ()) -> Backbone:

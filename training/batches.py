@@ -151,7 +151,7 @@ class TrainingItems(Dataset):
         inputs = stage_inputs(
             stage, first_frame_CFHW=target, target_shape=_shape(target), references=tensors, control=control,
             text=self._store.text("" if dropped else clip.caption), fps=self._store.fps,
-            text_tokens=config.backbone.text_tokens,
+            text_tokens=config.backbone.text_tokens, image_1D=self._store.image_embedding(key),
         )  # fmt: skip
         noise = keyed_normal(_shape(target), *keyed, "noise")
         normal = keyed_normal((1,), *keyed, "sigma")

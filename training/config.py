@@ -62,6 +62,8 @@ class BackboneConfig(_Settings):
     """Of the frozen weights; adapters are always float32."""
     latent_dtype: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of the cached latents."""
+    text_width: int = 4096
+    """Channels of the text encoder; what SVD's text projection is sized by."""
     text_tokens: int = 128
     """Captions are cut and padded to this many tokens."""
     vae_tiling: bool = False
@@ -85,7 +87,7 @@ BACKBONES: dict[str, dict[str, Any]] = {
         "picture": {"control_width": 192, "control_height": 128, "rgb_width": 192, "rgb_height": 128},
     },
     "tiny-svd": {
-        "kind": "tiny_svd",
+        "kind": "tiny_svd", "text_width": 32,
         "picture": {
             "control_width": 96, "control_height": 64, "rgb_width": 96, "rgb_height": 64, "frames": 5, "frame_step": 2,
         },
@@ -100,7 +102,7 @@ BACKBONES: dict[str, dict[str, Any]] = {
     },
     "svd": {
         "kind": "svd", "size": "svd", "weights": "stabilityai/stable-video-diffusion-img2vid-xt",
-        "text_weights": "google/t5-v1_1-large", "dtype": "bfloat16", "latent_dtype": "bfloat16",
+        "text_weights": "google/t5-v1_1-large", "text_width": 1024, "dtype": "bfloat16", "latent_dtype": "bfloat16",
         "picture": {
             "control_width": 768, "control_height": 512, "rgb_width": 768, "rgb_height": 512,
             "frames": 25, "frame_step": 2,

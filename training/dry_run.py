@@ -84,6 +84,10 @@ def plan_run(config: TrainConfig, *, steps_per_second: float | None = None) -> R
     denoiser, geometry, hidden, layers = _meta_network(config)
     base = sum(weight.numel() for weight in denoiser.parameters())
     trainable = lora_parameters(denoiser, config.adapter.targets, rank=config.adapter.rank)
+    if config.backbone.kind in ("svd", "tiny_svd"):
+        from training.svd import extra_parameters
+
+        trainable += extra_parameters(denoiser, config)
     target, most, mean = token_counts(config, geometry)
     optimiser = config.optimiser
     kept = layers * (_KEPT_PER_TOKEN if config.gradient_checkpointing else _PEAK_PER_TOKEN)

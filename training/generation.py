@@ -162,7 +162,7 @@ class ClipGenerator:
         references = self._motion_references(conditions, picture)
         references[IMAGE] = self.backbone.encode_video(covered(conditions.image, **size)[None])
         first = self.backbone.encode_video(fitted(conditions.first_control[None], **size))
-        return self._drawn("motion", first, references, conditions.caption, picture, keyed=keyed, settings=settings)
+        return self._drawn("motion", first, references, conditions, picture, keyed=keyed, settings=settings)
 
     def _motion_references(self, conditions: ClipConditions, picture: PictureConfig) -> dict[str, torch.Tensor]:
         given = {EGO: conditions.ego, OBJECTS: conditions.objects}
@@ -184,23 +184,24 @@ class ClipGenerator:
             references = self._motion_references(conditions, picture)
         first = covered(conditions.image, width=picture.rgb_width, height=picture.rgb_height)[None]
         first_latents = self.backbone.encode_video(first)
-        return self._drawn(
-            stage, first_latents, references, conditions.caption, picture, keyed=keyed, settings=settings
-        )
+        return self._drawn(stage, first_latents, references, conditions, picture, keyed=keyed, settings=settings)
 
     def _drawn(
-        self, stage: Stage, first: torch.Tensor, references: dict[str, torch.Tensor], caption: str,
+        self, stage: Stage, first: torch.Tensor, references: dict[str, torch.Tensor], conditions: ClipConditions,
         picture: PictureConfig, *, keyed: tuple[int, int], settings: SamplingSettings,
     ) -> torch.Tensor:  # fmt: skip
         shape = self.backbone.geometry.latent_shape(
             frames=self.frame_count, height=first.shape[2] * self.backbone.geometry.spatial,
             width=first.shape[3] * self.backbone.geometry.spatial,
         )  # fmt: skip
+        caption = conditions.caption
+        image = covered(conditions.image, width=picture.rgb_width, height=picture.rgb_height)
         if caption not in self._texts:
             self._texts[caption] = self.backbone.encode_text([caption])[0]
         inputs = stage_inputs(
             stage, first_frame_CFHW=first, target_shape=shape, references=references, text=self._texts[caption],
             text_tokens=self.backbone.config.text_tokens, fps=picture.fps, control=self.control_name(stage),
+            image_1D=self.backbone.encode_image(image),
         )  # fmt: skip
         activate_adapter(self.backbone.denoiser, stage)
         noise = keyed_normal((1, *shape), *keyed, stage)

@@ -22,6 +22,7 @@ from training.backbone import TextEmbedding
 from training.stages import OBJECTS
 
 MANIFEST = "cache.json"
+IMAGE_EMBEDDING = "image_embedding"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,6 +157,10 @@ class LatentStore:
     def mask(self, key: str, control: str) -> torch.Tensor:
         """(F, H, W) bool: lit latent cells of a control video."""
         return self.read(key, [f"mask_{control}"])[f"mask_{control}"].bool()
+
+    def image_embedding(self, key: str) -> torch.Tensor | None:
+        """(1, D) of the first RGB frame, where the backbone has an image encoder."""
+        return self.read(key, [IMAGE_EMBEDDING])[IMAGE_EMBEDDING] if "image" in self.manifest.parts else None
 
     def text(self, caption: str) -> TextEmbedding:
         """The embedding of a caption that was cached; the empty one always is.

@@ -25,6 +25,7 @@ from training.backbone import Backbone, load_backbone
 from training.clip_views import ClipSample, ClipViews, frame_indices
 from training.config import BackboneConfig, PictureConfig, backbone_config
 from training.latent_store import (
+    IMAGE_EMBEDDING,
     MANIFEST,
     CacheManifest,
     ClipRecord,
@@ -197,18 +198,23 @@ def encode_clip(
         intrinsics=Intrinsics(**camera) if camera else None,
     )  # fmt: skip
     dtype = getattr(torch, backbone.config.latent_dtype)
+    rgb = views.rgb()
     tensors = {
-        name: backbone.encode_video(frames).to(dtype) for name, frames in _videos(views, controls, object_variants)
+        name: backbone.encode_video(frames).to(dtype) for name, frames in _videos(views, rgb, controls, object_variants)
     }
     tensors["mask_skeleton"] = torch.from_numpy(views.skeleton_cells(backbone.geometry).astype(np.uint8))
+    embedding = backbone.encode_image(rgb[0])
+    if embedding is not None:
+        tensors[IMAGE_EMBEDDING] = embedding.to(dtype)
     for name in controls:
         # Every cell counts where there are no labels to say which are lit.
         tensors[f"mask_{name}"] = torch.ones(tensors[name].shape[1:], dtype=torch.uint8)
     return {name: tensor.contiguous() for name, tensor in tensors.items()}
 
 
-def _videos(views: ClipViews, controls: Sequence[str], object_variants: int) -> Iterator[tuple[str, np.ndarray]]:
-    rgb = views.rgb()
+def _videos(
+    views: ClipViews, rgb: np.ndarray, controls: Sequence[str], object_variants: int
+) -> Iterator[tuple[str, np.ndarray]]:
     yield RGB, rgb
     yield IMAGE, views.image(rgb)
     yield "skeleton", views.skeleton()

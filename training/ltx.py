@@ -1,8 +1,4 @@
-"""The LTX-Video backbone: diffusers' transformer, video VAE and T5 encoder, from a folder, a single file or a hub id.
-
-Networks load when they are first used, so that training needs neither the VAE nor the text encoder, and caching does
-not need the transformer.
-"""
+"""The LTX-Video backbone: diffusers' transformer, video VAE and T5 encoder, from a folder, one file or a hub id."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,18 +11,19 @@ from diffusers.models.transformers.transformer_ltx import LTXVideoTransformer3DM
 
 from labeling.errors import ModelError
 from training.adapters import AdapterFile, attach_adapter, load_adapter
-from training.backbone import LatentGeometry, SamplingSettings, StageInputs, TextEmbedding, pad_text
-from training.conditioning import TIMESTEP_SCALE, TokenSequence, assemble_tokens, pack, sequence_tokens, unpack
+from training.backbone import LatentGeometry, SamplingSettings, StageInputs, TextEmbedding, with_empty_text
+from training.conditioning import TokenSequence, assemble_tokens, pack, sequence_tokens, unpack
 from training.config import AdapterConfig, BackboneConfig
 from training.flow import (
     Convention,
     interpolate,
     masked_mse,
     sampling_sigmas,
-    shift_for_tokens,
     sigma_from_normal,
     velocity_target,
 )
+from training.parts import LazyParts
+from training.text import embed_captions
 from training.weights import digest_module, load_pretrained, load_text_encoder
 
 TRANSFORMERS: dict[str, dict[str, Any]] = {
@@ -35,47 +32,16 @@ TRANSFORMERS: dict[str, dict[str, Any]] = {
 }
 """What differs from diffusers' defaults (which are the 2B model's) in each released transformer."""
 
+LTX_GEOMETRY = LatentGeometry(channels=128, spatial=32, temporal=8)
 DECODE_TIMESTEP, DECODE_NOISE = 0.05, 0.025
 """For decoders with timestep conditioning, as LTX-Video's own examples set them."""
 
 
-class LtxBackbone:
+class LtxBackbone(LazyParts):
     """See ``training.backbone.Backbone``."""
 
     adapter_prefix = "transformer"
-
-    def __init__(
-        self,
-        config: BackboneConfig,
-        *,
-        geometry: LatentGeometry,
-        device: str | torch.device,
-        make_denoiser: Callable[[], LTXVideoTransformer3DModel],
-        make_vae: Callable[[], AutoencoderKLLTXVideo],
-        make_text: Callable[[], tuple[Any, torch.nn.Module]],
-    ) -> None:
-        self.config, self.geometry, self.device = config, geometry, torch.device(device)
-        self.dtype: torch.dtype = getattr(torch, config.dtype)
-        self._makers: dict[str, Callable[[], Any]] = {"denoiser": make_denoiser, "vae": make_vae, "text": make_text}
-        self._parts: dict[str, Any] = {}
-
-    def _part(self, name: str) -> Any:
-        if name not in self._parts:
-            part = self._makers[name]()
-            for module in part if isinstance(part, tuple) else (part,):
-                if isinstance(module, torch.nn.Module):
-                    module.to(self.device)
-                    # A cast that changes nothing would only make diffusers warn.
-                    if any(weight.dtype != self.dtype for weight in module.parameters()):
-                        module.to(self.dtype)
-                    module.eval().requires_grad_(False)
-            self._parts[name] = part
-        return self._parts[name]
-
-    def release(self, parts: Sequence[str]) -> None:
-        """Forget parts; they load again when used."""
-        for name in parts:
-            self._parts.pop(name, None)
+    geometry = LTX_GEOMETRY
 
     def attach(self, name: str, config: AdapterConfig) -> list[torch.nn.Parameter]:
         """A fresh trainable adapter, active; its parameters."""
@@ -85,20 +51,15 @@ class LtxBackbone:
         """An adapter file, not active."""
         return load_adapter(self.denoiser, path, name)
 
-    def preload(self, parts: Sequence[str]) -> None:
-        """Load these parts now."""
-        for name in parts:
-            self._part(name)
-
     @property
     def denoiser(self) -> LTXVideoTransformer3DModel:
         """The transformer."""
-        return self._part("denoiser")
+        return self.part("denoiser")
 
     @property
     def vae(self) -> AutoencoderKLLTXVideo:
         """The video VAE."""
-        vae = self._part("vae")
+        vae = self.part("vae")
         if self.config.vae_tiling:
             vae.enable_tiling()
         return vae
@@ -106,7 +67,7 @@ class LtxBackbone:
     @property
     def text(self) -> tuple[Any, torch.nn.Module]:
         """(tokenizer, encoder)."""
-        return self._part("text")
+        return self.part("text")
 
     @torch.no_grad()
     def encode_video(self, frames_THWC: np.ndarray) -> torch.Tensor:
@@ -146,18 +107,13 @@ class LtxBackbone:
         )
         return mean, std, float(self.vae.config["scaling_factor"])
 
+    def encode_image(self, frame_HWC: np.ndarray) -> None:
+        """LTX sees images through its VAE only."""
+
     @torch.no_grad()
     def encode_text(self, captions: Sequence[str]) -> list[TextEmbedding]:
         """One unpadded T5 embedding per caption, cut at ``text_tokens``, float32 on the CPU."""
-        tokenizer, encoder = self.text
-        embeddings = []
-        for caption in captions:
-            tokens = tokenizer([caption], max_length=self.config.text_tokens, truncation=True, return_tensors="pt")
-            hidden = encoder(
-                input_ids=tokens.input_ids.to(self.device), attention_mask=tokens.attention_mask.to(self.device)
-            )[0]
-            embeddings.append(TextEmbedding(tokens_LD=hidden[0].float().cpu()))
-        return embeddings
+        return embed_captions(*self.text, captions, length=self.config.text_tokens)
 
     def fingerprint(self) -> dict[str, str]:
         """sha256 of the VAE's and of the text encoder's weights and settings."""
@@ -180,8 +136,7 @@ class LtxBackbone:
     ) -> tuple[torch.Tensor, TokenSequence]:
         """The network's v over the target's tokens, (B, N_target, C), and the sequence it was fed."""
         sequence = assemble_tokens(inputs, noisy_BCFHW, sigma_B=sigma_B, geometry=self.geometry, convention=convention)
-        # Autocast, in training and in sampling alike: the float32 adapters multiply in the base's bfloat16.
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype == torch.bfloat16):
+        with self.autocast():
             predicted = self.denoiser(
                 hidden_states=sequence.hidden_BNC.to(self.dtype),
                 encoder_hidden_states=inputs.text_BLD.to(self.dtype),
@@ -220,37 +175,12 @@ class LtxBackbone:
     ) -> torch.Tensor:  # fmt: skip
         if guidance == 1:
             return self.velocity(inputs, latents, sigma_B=sigma_B, convention=convention)[0]
-        both = _with_empty_text(inputs, empty_text)
+        both = with_empty_text(inputs, empty_text)
         doubled, _ = self.velocity(
             both, latents.repeat(2, 1, 1, 1, 1), sigma_B=sigma_B.repeat(2), convention=convention
         )
         without, with_text = doubled.chunk(2)
         return without + guidance * (with_text - without)
-
-    def timestep_of(self, sigma: float) -> float:
-        """What the network is told at ``sigma``."""
-        return sigma * TIMESTEP_SCALE
-
-    def shift(self, target_shape: tuple[int, int, int, int]) -> float:
-        """The noise shift at this size, for the record."""
-        return shift_for_tokens(target_shape[1] * target_shape[2] * target_shape[3])
-
-
-def _with_empty_text(inputs: StageInputs, empty_text: TextEmbedding) -> StageInputs:
-    """The batch twice: first with the empty caption, then with its own."""
-    batch, length = inputs.text_mask_BL.shape
-    empty_BLD, empty_mask = pad_text([empty_text] * batch, length=length)
-    references = tuple(
-        type(r)(
-            name=r.name, latents_BCFHW=r.latents_BCFHW.repeat(2, 1, 1, 1, 1), first_latent_frame=r.first_latent_frame
-        )
-        for r in inputs.references
-    )
-    return StageInputs(
-        target_shape=inputs.target_shape, first_frame_BCFHW=inputs.first_frame_BCFHW.repeat(2, 1, 1, 1, 1),
-        references=references, text_BLD=torch.cat([empty_BLD.to(inputs.text_BLD), inputs.text_BLD]),
-        text_mask_BL=torch.cat([empty_mask.to(inputs.text_mask_BL.device), inputs.text_mask_BL]), fps=inputs.fps,
-    )  # fmt: skip
 
 
 def load_ltx(config: BackboneConfig, *, device: str | torch.device = "cpu", parts: Sequence[str] = ()) -> LtxBackbone:
@@ -259,22 +189,23 @@ def load_ltx(config: BackboneConfig, *, device: str | torch.device = "cpu", part
     Raises:
         ModelError: weights that are absent or do not fit.
     """
-    if config.weights is None:
-        if config.kind != "tiny":
-            raise ModelError(f"backbone {config.name} has no weights; set backbone.weights to a folder, file or hub id")
+    if config.weights is not None:
+        makers = _makers(config, config.weights)
+    elif config.kind == "tiny":
         from training.tiny import tiny_ltx_makers
 
         makers = tiny_ltx_makers(config)
     else:
-        dtype = getattr(torch, config.dtype)
-        source = config.weights
-        text_source = config.text_weights or source
-        makers = {
-            "make_denoiser": lambda: load_pretrained(LTXVideoTransformer3DModel, source, "transformer", dtype=dtype),
-            "make_vae": lambda: load_pretrained(AutoencoderKLLTXVideo, source, "vae", dtype=dtype),
-            "make_text": lambda: load_text_encoder(text_source, dtype=dtype, single_file=Path(source).is_file()),
-        }
-    geometry = LatentGeometry(channels=128, spatial=32, temporal=8)
-    backbone = LtxBackbone(config, geometry=geometry, device=device, **makers)
+        raise ModelError(f"backbone {config.name} has no weights; set backbone.weights to a folder, file or hub id")
+    backbone = LtxBackbone(config, device=device, makers=makers)
     backbone.preload(parts)
     return backbone
+
+
+def _makers(config: BackboneConfig, source: str) -> dict[str, Callable[[], Any]]:
+    dtype, text_source = getattr(torch, config.dtype), config.text_weights or source
+    return {
+        "denoiser": lambda: load_pretrained(LTXVideoTransformer3DModel, source, "transformer", dtype=dtype),
+        "vae": lambda: load_pretrained(AutoencoderKLLTXVideo, source, "vae", dtype=dtype),
+        "text": lambda: load_text_encoder(text_source, dtype=dtype, single_file=Path(source).is_file()),
+    }

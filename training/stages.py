@@ -39,6 +39,7 @@ def stage_inputs(
     text_tokens: int,
     fps: float,
     control: str = "skeleton",
+    image_1D: torch.Tensor | None = None,
 ) -> StageInputs:
     """One sample's inputs, as a batch of one.
 
@@ -51,6 +52,7 @@ def stage_inputs(
         text_tokens: padded length.
         fps: video frames per second.
         control: name of the intermediate representation.
+        image_1D: the first RGB frame's embedding, for backbones with an image encoder.
 
     Raises:
         DataError: a condition that the stage cannot do without is absent, or one that it does not take is given.
@@ -76,9 +78,11 @@ def stage_inputs(
             for name in allowed
             if name in references
         ),
+        slots=allowed,
         text_BLD=text_BLD.float(),
         text_mask_BL=mask_BL,
         fps=fps,
+        image_B1D=None if image_1D is None else image_1D[None].float(),
     )
 
 
@@ -105,4 +109,6 @@ def stack_inputs(inputs: Sequence[StageInputs]) -> StageInputs:
         text_BLD=torch.cat([one.text_BLD for one in inputs]),
         text_mask_BL=torch.cat([one.text_mask_BL for one in inputs]),
         fps=first.fps,
+        slots=first.slots,
+        image_B1D=None if first.image_B1D is None else torch.cat([one.image_B1D for one in inputs]),  # type: ignore[misc]
     )

@@ -10,7 +10,9 @@ from typing import Any, TypeVar
 
 import torch
 from diffusers.models.autoencoders.autoencoder_kl_ltx import AutoencoderKLLTXVideo
+from diffusers.models.autoencoders.autoencoder_kl_temporal_decoder import AutoencoderKLTemporalDecoder
 from diffusers.models.transformers.transformer_ltx import LTXVideoTransformer3DModel
+from diffusers.models.unets.unet_spatio_temporal_condition import UNetSpatioTemporalConditionModel
 
 from training.config import BackboneConfig
 
@@ -30,6 +32,14 @@ TINY_VAE: dict[str, Any] = {
     "patch_size": 4, "patch_size_t": 1, "encoder_causal": True, "decoder_causal": False,
 }  # fmt: skip
 """158 thousand parameters with the true ratios: 32 pixels, 8 frames, 128 channels."""
+
+TINY_UNET: dict[str, Any] = {
+    "sample_size": 8, "in_channels": 8, "out_channels": 4, "num_frames": 5, "layers_per_block": 1,
+    "down_block_types": ("CrossAttnDownBlockSpatioTemporal", "DownBlockSpatioTemporal"),
+    "up_block_types": ("UpBlockSpatioTemporal", "CrossAttnUpBlockSpatioTemporal"), "block_out_channels": (32, 64),
+    "cross_attention_dim": TEXT_CHANNELS, "num_attention_heads": (2, 4), "addition_time_embed_dim": 32,
+    "projection_class_embeddings_input_dim": 96,
+}  # fmt: skip
 
 
 def seeded(make: Callable[[], Made], *, seed: int) -> Made:
@@ -61,9 +71,46 @@ def tiny_text(seed: int = 0) -> tuple[Any, torch.nn.Module]:
 
 
 def tiny_ltx_makers(config: BackboneConfig) -> dict[str, Callable[[], Any]]:
-    """The makers that ``LtxBackbone`` takes."""
+    """The makers of an LTX backbone's parts."""
     return {
-        "make_denoiser": lambda: tiny_transformer(config.seed),
-        "make_vae": lambda: tiny_vae(config.seed),
-        "make_text": lambda: tiny_text(config.seed),
+        "denoiser": lambda: tiny_transformer(config.seed),
+        "vae": lambda: tiny_vae(config.seed),
+        "text": lambda: tiny_text(config.seed),
+    }
+
+
+def tiny_unet(seed: int = 0) -> UNetSpatioTemporalConditionModel:
+    """The tiny SVD network."""
+    return seeded(lambda: UNetSpatioTemporalConditionModel(**TINY_UNET), seed=seed)
+
+
+def tiny_image_vae(seed: int = 0) -> AutoencoderKLTemporalDecoder:
+    """The tiny SVD VAE with the true ratio of 8 pixels a cell."""
+    blocks = ("DownEncoderBlock2D",) * 4
+    return seeded(
+        lambda: AutoencoderKLTemporalDecoder(
+            down_block_types=blocks, block_out_channels=(32,) * 4, layers_per_block=1, latent_channels=4
+        ),
+        seed=seed,
+    )
+
+
+def tiny_image_encoder(seed: int = 0) -> torch.nn.Module:
+    """A two-layer random CLIP over 32x32 pictures."""
+    from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+    config = CLIPVisionConfig(
+        hidden_size=32, intermediate_size=64, num_hidden_layers=2, num_attention_heads=4, image_size=32, patch_size=16,
+        projection_dim=TEXT_CHANNELS,
+    )  # fmt: skip
+    return seeded(lambda: CLIPVisionModelWithProjection(config), seed=seed)
+
+
+def tiny_svd_makers(config: BackboneConfig) -> dict[str, Callable[[], Any]]:
+    """The makers of an SVD backbone's parts."""
+    return {
+        "denoiser": lambda: tiny_unet(config.seed),
+        "vae": lambda: tiny_image_vae(config.seed),
+        "text": lambda: tiny_text(config.seed),
+        "image": lambda: tiny_image_encoder(config.seed),
     }

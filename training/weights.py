@@ -58,6 +58,20 @@ def load_text_encoder(source: str, *, dtype: torch.dtype, single_file: bool = Fa
     return tokenizer, encoder
 
 
+def load_image_encoder(source: str, *, dtype: torch.dtype) -> torch.nn.Module:
+    """The CLIP image encoder from the ``image_encoder`` part of a folder or hub id.
+
+    Raises:
+        ModelError: nothing there.
+    """
+    from transformers import CLIPVisionModelWithProjection
+
+    try:
+        return CLIPVisionModelWithProjection.from_pretrained(source, subfolder="image_encoder", dtype=dtype)
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise ModelError(f"no CLIP image encoder in {source!r} ({_first_line(error)}); {_ADVICE}") from error
+
+
 def tensor_bytes(tensors: Mapping[str, torch.Tensor], *, metadata: Mapping[str, str] | None = None) -> bytes:
     """A safetensors file; the same tensors and metadata give the same bytes.
 

@@ -1,0 +1,192 @@
+"""The two-stage generator: conditions, seeds, hand-over of latents, recipes for ego-motion, clear answers."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from training_fixtures import HEIGHT, PICTURE, WIDTH, FakeSample, one_thread, tiny_config, tiny_job  # noqa: F401
+
+from labeling.camera import rotation_angle_deg, write_tum
+from labeling.errors import ConfigError, DataError, ModelError
+from labeling.skeleton_video import draw_skeletons
+from labeling.video import frame_count, read_frames
+from training.backbone import SamplingSettings, load_backbone
+from training.clip_views import clip_trajectory
+from training.config import Stage, backbone_config
+from training.ego_recipes import recipe_trajectory
+from training.generation import ClipConditions, ClipGenerator, generate
+from training.sampling_inputs import control_clip, ego_trajectory
+from training.trainer import TrainSummary, train
+
+SAMPLE = FakeSample(key="other_0")
+IMAGE = SAMPLE.frames("rgb.mp4")[0]
+SKELETON = draw_skeletons(SAMPLE.keypoints()[:1], width=WIDTH, height=HEIGHT, label_width=WIDTH, label_height=HEIGHT)
+FAST = SamplingSettings(steps=2, guidance=3.0)
+
+
+@pytest.fixture(scope="module")
+def adapters(tiny_job: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[Stage, Path]:  # noqa: F811
+    found: dict[Stage, Path] = {}
+    stages: tuple[Stage, ...] = ("motion", "appearance", "end_to_end")
+    for stage in stages:
+        out = tmp_path_factory.mktemp(stage)
+        summary = train(tiny_config(stage, optimiser={"steps": 3}), data=tiny_job, out=out, quiet=True)
+        assert isinstance(summary, TrainSummary)
+        found[stage] = summary.adapter
+    return found
+
+
+@pytest.fixture(scope="module")
+def generator(adapters: dict[Stage, Path]) -> ClipGenerator:
+    backbone = load_backbone(backbone_config("tiny", picture=PICTURE))
+    return ClipGenerator(backbone, motion=adapters["motion"], appearance=adapters["appearance"])
+
+
+def two_stages(adapters: dict[Stage, Path]) -> dict[str, Path]:
+    return {"motion": adapters["motion"], "appearance": adapters["appearance"]}
+
+
+def test_both_videos_are_written_and_a_seed_gives_the_same_files(adapters, tmp_path: Path) -> None:
+    runs = [
+        generate(
+            image=IMAGE, caption="A road.", out=tmp_path / name, skeleton=SKELETON, ego="straight 10m/s", steps=2,
+            samples=2, seed=seed, **two_stages(adapters),
+        )
+        for name, seed in (("a", 7), ("b", 7), ("c", 8))
+    ]  # fmt: skip
+    names = [(sample.rgb.name, sample.control.parent.name) for sample in runs[0]]
+    assert names == [("sample_0.mp4", "skeleton"), ("sample_1.mp4", "skeleton")]
+    for first, again, other in zip(*runs, strict=True):
+        for kind in ("rgb", "control"):
+            data = [getattr(one, kind).read_bytes() for one in (first, again, other)]
+            assert data[0] == data[1] != data[2]
+        assert frame_count(first.rgb) == frame_count(first.control) == 9
+    assert runs[0][0].rgb.read_bytes() != runs[0][1].rgb.read_bytes()
+
+
+def test_the_motion_latents_pass_to_the_appearance_stage_undecoded(generator, monkeypatch) -> None:
+    drawn, given = {}, {}
+    real = generator._drawn
+
+    def watched(stage, first, references, *rest, **named):
+        drawn[stage] = real(stage, first, references, *rest, **named)
+        given[stage] = references
+        return drawn[stage]
+
+    monkeypatch.setattr(generator, "_drawn", watched)
+    conditions = ClipConditions(image=IMAGE, caption="A road.", first_control=SKELETON)
+    generator.sample(conditions, settings=FAST)
+    assert given["appearance"]["skeleton"] is drawn["motion"]
+    assert set(given["motion"]) == {"image"}
+
+
+def test_conditions_change_the_sample_and_their_absence_is_a_condition_too(generator) -> None:
+    black = np.zeros((9, HEIGHT, WIDTH, 3), np.uint8)
+    bright = np.full_like(black, 200)
+    plain = {"image": IMAGE, "caption": "A road.", "first_control": SKELETON}
+    variants = [{}, {"ego": bright}, {"objects": bright}, {"ego": bright, "objects": black}, {"caption": "Night."}]
+    clips = [generator.sample(ClipConditions(**plain | extra), settings=FAST).control for extra in variants]
+    for place, one in enumerate(clips):
+        for other in clips[place + 1 :]:
+            assert not np.array_equal(one, other)
+
+
+def test_a_given_skeleton_video_replaces_the_motion_stage(generator, adapters) -> None:
+    video = np.stack([SKELETON] * 9)
+    alone = ClipGenerator(load_backbone(generator.backbone.config), appearance=adapters["appearance"])
+    conditions = ClipConditions(image=IMAGE, caption="A road.", control=video)
+    clips = [one.sample(conditions, settings=FAST) for one in (generator, alone)]
+    assert np.array_equal(clips[0].control, video)
+    assert np.array_equal(clips[0].rgb, clips[1].rgb)
+
+
+def test_end_to_end_makes_rgb_alone(adapters, tmp_path: Path) -> None:
+    (made,) = generate(
+        image=IMAGE, caption="A road.", out=tmp_path, end_to_end=adapters["end_to_end"], ego="still", steps=2
+    )
+    assert made.control is None and frame_count(made.rgb) == 9
+
+
+def test_files_on_disk_do_as_well_as_arrays(adapters, tmp_path: Path) -> None:
+    for name, picture in (("first.png", IMAGE), ("skeleton.png", SKELETON)):
+        cv2.imwrite(str(tmp_path / name), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    (a,) = generate(
+        image=tmp_path / "first.png", caption="A road.", out=tmp_path / "a", skeleton=tmp_path / "skeleton.png",
+        steps=2, **two_stages(adapters),
+    )  # fmt: skip
+    (b,) = generate(
+        image=IMAGE, caption="A road.", out=tmp_path / "b", skeleton=SKELETON, steps=2, name="first",
+        **two_stages(adapters),
+    )  # fmt: skip
+    assert a.rgb.name == "first_0.mp4"
+    assert a.rgb.read_bytes() == b.rgb.read_bytes()
+    # The skeleton video is lossless, so it can be given back.
+    assert np.array_equal(
+        control_clip(a.control, frames=9, picture=backbone_config("tiny", picture=PICTURE).picture),
+        np.stack(list(read_frames(a.control))),
+    )
+
+
+def test_recipes_drive_where_they_say() -> None:
+    straight = recipe_trajectory("straight 10m/s", frames=121, fps=24)
+    assert straight.cam_to_world[-1, :3, 3] == pytest.approx([0, 0, 50])
+    assert recipe_trajectory("straight 36km/h", frames=121, fps=24).path_length_m == pytest.approx(50)
+    left = recipe_trajectory("left 30deg", frames=121, fps=24)
+    assert left.cam_to_world[-1, 0, 3] < -5
+    assert float(rotation_angle_deg(left.cam_to_world[-1:, :3, :3])[0]) == pytest.approx(30)
+    assert left.path_length_m == pytest.approx(40, rel=1e-3)
+    # The camera looks where it drives.
+    steps = np.diff(left.positions, axis=0)
+    ahead = (left.cam_to_world[:-1, :3, 2] + left.cam_to_world[1:, :3, 2]) / 2
+    assert np.allclose((steps * ahead).sum(1), np.linalg.norm(steps, axis=1), rtol=1e-3)
+    right = recipe_trajectory("right 45deg 8m/s", frames=25, fps=24)
+    assert right.cam_to_world[-1, 0, 3] > 0
+    assert recipe_trajectory("reverse 3m/s", frames=25, fps=24).cam_to_world[-1, 2, 3] == pytest.approx(-3)
+    assert recipe_trajectory("still", frames=9, fps=24).path_length_m == 0
+
+
+@pytest.mark.parametrize("recipe", ["", "up 3m/s", "left thirty", "straight 10mph", "missing.tum"])
+def test_recipes_that_are_not_understood_say_what_is(recipe: str) -> None:
+    with pytest.raises(ConfigError, match=r"straight 10m/s \| left 30deg"):
+        ego_trajectory(recipe, frames=9, fps=24)
+
+
+def test_trajectory_files_are_resampled_and_must_be_long_enough(tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, 2, 3] = np.arange(30.0)
+    write_tum(clip_trajectory(poses, fps=10.0), tmp_path / "drive.tum")
+    found = ego_trajectory(tmp_path / "drive.tum", frames=25, fps=24)
+    assert len(found) == 25
+    assert found.cam_to_world[-1, 2, 3] == pytest.approx(10)
+    with pytest.raises(ConfigError, match="lasts 2.90 s, the clip 5.00 s"):
+        ego_trajectory(tmp_path / "drive.tum", frames=121, fps=24)
+    np.save(tmp_path / "drive.npy", poses)
+    assert ego_trajectory(tmp_path / "drive.npy", frames=9, fps=24).cam_to_world[-1, 2, 3] == pytest.approx(8)
+
+
+def test_what_is_missing_or_wrong_is_named(generator, adapters, tmp_path: Path, monkeypatch) -> None:
+    with pytest.raises(ConfigError, match="--motion and --appearance"):
+        ClipGenerator(generator.backbone)
+    with pytest.raises(ConfigError, match="needs a skeleton video"):
+        generator.sample(ClipConditions(image=IMAGE, caption="x"), settings=FAST)
+    (tmp_path / "a.png").write_text("no picture")
+    with pytest.raises(DataError, match="not a picture"):
+        generate(image=tmp_path / "a.png", caption="x", out=tmp_path, skeleton=SKELETON, **two_stages(adapters))
+    with pytest.raises(ModelError, match=r"give the \.safetensors file"):
+        generate(image=IMAGE, caption="x", out=tmp_path, motion=tmp_path / "none.safetensors", backbone="tiny")
+    from labeling import extractors
+
+    monkeypatch.setattr(extractors, "find_weights", lambda *_: None)
+    with pytest.raises(ConfigError, match="no extractors"):
+        generate(image=IMAGE, caption="x", out=tmp_path, **two_stages(adapters))
+
+
+def test_a_folder_that_cannot_be_written_to_is_a_storage_error(generator, tmp_path: Path) -> None:
+    from labeling.errors import StorageError
+    from training.generation import GeneratedClip, write_clip
+
+    (tmp_path / "file").write_text("in the way")
+    clip = GeneratedClip(rgb=np.zeros((2, 64, 96, 3), np.uint8), control=None)
+    with pytest.raises(StorageError):
+        write_clip(clip, tmp_path / "file", "a", fps=24, seed=0, number=0)
