@@ -14,14 +14,14 @@ _LAMP_COLOUR = np.array([255.0, 244.0, 214.0])
 class AugmentSettings:
     """How often each disturbance strikes, and how hard at most; lengths are pixels of the network's input."""
 
-    dusk: float = 0.2
-    night: float = 0.12
-    blur: float = 0.2
+    dusk: float = 0.15
+    night: float = 0.1
+    blur: float = 0.15
     blur_px: int = 8
-    weather: float = 0.15
-    noise: float = 0.4
+    weather: float = 0.1
+    noise: float = 0.3
     noise_sigma: float = 7.0
-    compression: float = 0.3
+    compression: float = 0.2
 
 
 def disturb(picture: np.ndarray, rng: np.random.Generator, settings: AugmentSettings) -> np.ndarray:
@@ -57,6 +57,7 @@ def random_map(
     scales: tuple[float, float],
     flip: bool,
     rotation_deg: float = 0.0,
+    focus_xy: np.ndarray | None = None,
 ) -> np.ndarray:
     """(2, 3) affine map that puts a part of a picture, scaled and perhaps mirrored, into a window.
 
@@ -67,6 +68,7 @@ def random_map(
         scales: least and largest scale, drawn evenly in its logarithm.
         flip: mirror left and right.
         rotation_deg: largest turn to either side.
+        focus_xy: (2,) a place in the picture that should come to lie somewhere in the middle of the window.
     """
     scale = math.exp(rng.uniform(math.log(scales[0]), math.log(scales[1])))
     angle = math.radians(rng.uniform(-rotation_deg, rotation_deg))
@@ -75,6 +77,9 @@ def random_map(
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     linear = scale * turn @ np.diag([-1.0 if flip else 1.0, 1.0])
     centre = np.array([source[0] - 1, source[1] - 1]) / 2
+    if focus_xy is not None:
+        wanted = rng.uniform(0.2, 0.8, 2) * target - (linear @ (focus_xy - centre) + scale * centre)
+        shift = [float(np.clip(wanted[axis], min(0.0, free[axis]), max(0.0, free[axis]))) for axis in (0, 1)]
     offset = np.array(shift) + scale * centre - linear @ centre
     return np.column_stack([linear, offset])
 

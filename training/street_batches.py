@@ -13,7 +13,7 @@ from labeling.model_cards import IMAGENET_MEAN, IMAGENET_STD
 from labeling.schemas import Category, KeypointSchema, keypoint_schema
 from training.street_augment import AugmentSettings, disturb, map_boxes, map_points, random_map
 from training.street_networks import FIELD_STRIDE
-from training.street_pool import ObjectTruth, PoolCrop, StreetPool
+from training.street_pool import ObjectTruth, PoolCrop, PoolFrame, StreetPool, frames_with
 from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses
 
 CLASSES: tuple[Category, ...] = ("car", "person")
@@ -64,17 +64,23 @@ class DetectorBatches:
     """Width and height of a window, multiples of 32."""
     count: int
     augment: AugmentSettings
-    scales: tuple[float, float] = (0.7, 1.35)
+    scales: tuple[float, float] = (0.85, 1.2)
+    person_share: float = 0.35
+    """Of windows around a person: they are small and rare."""
 
     def __call__(self, rng: np.random.Generator) -> Batch:
         """One batch: targets are classes (N, A) and boxes (N, A, 4)."""
         pictures, classes, boxes = [], [], []
-        for index in rng.integers(0, len(self.pool.frames), self.count):
+        with_people = frames_with(self.pool, "person")
+        for _ in range(self.count):
+            people = bool(len(with_people)) and rng.random() < self.person_share
+            index = int(rng.choice(with_people)) if people else int(rng.integers(len(self.pool.frames)))
             frame = self.pool.frames[index]
             height, width = frame.half.shape[:2]
             half_to_window = random_map(
-                rng, source=(width, height), target=self.size, scales=self.scales, flip=rng.random() < 0.5
-            )
+                rng, source=(width, height), target=self.size, scales=self.scales, flip=rng.random() < 0.5,
+                focus_xy=self._focus(frame, rng, "person" if people else "car"),
+            )  # fmt: skip
             grey = (LETTERBOX_GREY,) * 3
             window = cv2.warpAffine(disturb(frame.half, rng, self.augment), half_to_window, self.size, borderValue=grey)
             found = [truth for truth in frame.objects if truth.category in CLASSES]
@@ -85,6 +91,16 @@ class DetectorBatches:
             boxes.append(targets.boxes_xyxy)
         targets = (torch.from_numpy(np.stack(classes)), torch.from_numpy(np.stack(boxes)))
         return Batch(pictures=to_input(pictures, "bgr255"), targets=targets)
+
+    def _focus(self, frame: PoolFrame, rng: np.random.Generator, category: Category) -> np.ndarray | None:
+        """The middle of one object, half-size pixels; one window in four lies anywhere."""
+        boxes = [truth.box_xyxy for truth in frame.objects if truth.category == category and truth.visible_share > 0.2]
+        if not boxes or rng.random() < 0.25:
+            return None
+        # Large objects are few: the root of the height evens them out.
+        weights = np.sqrt([box[3] - box[1] for box in boxes])
+        box = boxes[int(rng.choice(len(boxes), p=weights / weights.sum()))]
+        return (box[:2] + box[2:]) / 4
 
     def _boxes(self, found: list[ObjectTruth], half_to_window: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if not found:
@@ -205,14 +221,15 @@ def field_object(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points in input pixels, which of them are there, and their scales, as ``encode_fields`` takes them.
 
-    A lane goes on behind a car: its hidden points are asked for. A car's are not.
+    A lane goes on behind a car: its hidden points are asked for. A car's are not. How far along a lane a point lies is
+    never sure, so that a lane's points are as wide as their spacing.
     """
     # Pixel centres lie on integers in both pictures.
     points = map_points(truth.points_xy / 2 - 0.25, half_to_input)
     there = truth.visible
     if table.category == "lane":
         steps = np.hypot(*np.diff(points, axis=0).T)
-        scales = np.clip(0.25 * np.minimum(np.append(steps, steps[-1]), np.append(steps[0], steps)), 4, 12)
+        scales = np.clip(0.75 * np.minimum(np.append(steps, steps[-1]), np.append(steps[0], steps)), 8, 24)
         there = np.isfinite(points).all(axis=1)
     else:
         order = mirror_order(table) if flip else slice(None)

@@ -118,7 +118,7 @@ def _detector_recipe(seed: int, share: float) -> Recipe:
     card = YoloxCard(
         name="street_detector", file="street_detector.onnx", licence=_LICENCE, source=_SOURCE, classes=CLASSES,
         categories={name: name for name in CLASSES}, input_width=_DETECTOR_SIZE[0], input_height=_DETECTOR_SIZE[1],
-        score_threshold=0.35, nms_threshold=0.55,
+        score_threshold=0.35, nms_threshold=0.45,
     )  # fmt: skip
     return Recipe(
         card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph,

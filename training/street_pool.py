@@ -1,5 +1,6 @@
 """Street frames rendered once and kept in memory: half-size pictures for detector and fields, crops for the heads."""
 
+import functools
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -65,6 +66,17 @@ class StreetPool:
 
     frames: tuple[PoolFrame, ...]
     crops: dict[Category, tuple[PoolCrop, ...]]
+
+
+@functools.lru_cache(maxsize=8)
+def frames_with(pool: StreetPool, category: Category, *, least_px: float = 20.0) -> np.ndarray:
+    """Indices of the pool's frames with an object of a category that is at least ``least_px`` high."""
+    found = [
+        index
+        for index, frame in enumerate(pool.frames)
+        if any(t.category == category and t.box_xyxy[3] - t.box_xyxy[1] >= least_px for t in frame.objects)
+    ]
+    return np.array(found, dtype=np.int64)
 
 
 def truths_of(frame: StreetFrame) -> tuple[ObjectTruth, ...]:

@@ -80,8 +80,8 @@ def match_boxes(found: Detections, truths: tuple[ObjectTruth, ...]) -> tuple[np.
     """Greedy one-to-one matches, best detection first.
 
     Returns:
-        (n,) the detection of each truth or -1, and the number of detections that match nothing and do not lie on an
-        object that is not judged.
+        (n,) the detection of each truth or -1, and the number of detections, high enough to be judged, that match
+        nothing and do not lie on an object that is not judged.
     """
     partner = np.full(len(truths), -1)
     phantoms = 0
@@ -96,7 +96,7 @@ def match_boxes(found: Detections, truths: tuple[ObjectTruth, ...]) -> tuple[np.
             excused = [
                 not is_judged(truth) and share > _EXCUSED_SHARE for truth, share in zip(truths, inside, strict=True)
             ]
-            phantoms += not any(excused)
+            phantoms += bool(box[3] - box[1] >= JUDGED_HEIGHT_PX) and not any(excused)
     return partner, phantoms
 
 
