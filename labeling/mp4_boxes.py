@@ -41,11 +41,17 @@ def top_level_boxes(path: Path) -> list[Box]:
     return boxes
 
 
+def is_cut_off(path: Path) -> bool:
+    """Whether a box of an MP4 claims more bytes than the file has."""
+    boxes = top_level_boxes(path)
+    return bool(boxes) and boxes[-1].start + boxes[-1].size > path.stat().st_size
+
+
 def indexed_frames(path: Path) -> int:
     """How many frames the index of a single-stream MP4 lists; 0 where there is no index or the file ends too early."""
     boxes = top_level_boxes(path)
     index = next((box for box in boxes if box.name == "moov"), None)
-    if index is None or boxes[-1].start + boxes[-1].size > path.stat().st_size:
+    if index is None or is_cut_off(path):
         return 0
     with path.open("rb") as file:
         file.seek(index.start)

@@ -20,6 +20,7 @@ from labeling.camera import PictureMap
 from labeling.conversion import FrameConverter, OutputPicture, colour_matrix, deinterlaced, is_full_range
 from labeling.encoding import EncoderSettings, VideoWriter, copy_packets, lossless_rgb
 from labeling.errors import VideoError
+from labeling.mp4_boxes import is_cut_off
 from labeling.sources import SAME_TIME_S, open_video, pick_video_stream, read_packets, read_packets_from, seconds
 
 __all__ = [
@@ -152,7 +153,8 @@ def read_packet_times(path: Path) -> PacketTimes:
                     untimed += 1
                 else:
                     times[seconds(packet.pts, packet.time_base)] = packet.is_keyframe
-        broken = max(broken, stream.frames - len(times) - untimed)
+        if is_cut_off(path):
+            broken = max(broken, stream.frames - len(times) - untimed)
     if untimed > len(times):
         raise VideoError(
             f"{path}: {untimed} of {untimed + len(times)} packets carry no presentation time; remux it first: "

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -46,14 +46,14 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         source = given.source or write_drive(Path(folder) / "source.mp4", seconds=given.seconds)
-        report = measure(source, Path(folder), rounds=given.rounds)
-    RESULT.parent.mkdir(exist_ok=True)
-    RESULT.write_text(json.dumps(report, indent=2) + "\n")
-    print(json.dumps(report["ratios"], indent=2))
+        for report in measured(source, Path(folder), rounds=given.rounds):
+            RESULT.parent.mkdir(exist_ok=True)
+            RESULT.write_text(json.dumps(report, indent=2) + "\n")
+            print(json.dumps(report["ratios"]), flush=True)
 
 
-def measure(source: Path, folder: Path, *, rounds: int) -> dict:
-    """Interleaved rounds of the three ways."""
+def measured(source: Path, folder: Path, *, rounds: int) -> Iterator[dict]:
+    """Interleaved rounds of the three ways; the report so far after each."""
     clips = list(plan_clips(plan_timeline(read_packet_times(source).times_s)).kept)
     ways: dict[str, Callable[[], list[list[str]]]] = {
         "ours": lambda: [[sys.executable, __file__, "--ours", str(source), str(folder)]],
@@ -65,15 +65,19 @@ def measure(source: Path, folder: Path, *, rounds: int) -> dict:
         for name, commands in ways.items():
             runs[name].append(timed(commands()))
             print(name, runs[name][-1], flush=True)
+        yield summary(source, len(clips), runs, json.loads((folder / "ours.json").read_text()))
+
+
+def summary(source: Path, clips: int, runs: dict[str, list[dict[str, float]]], peak: dict[str, int]) -> dict:
+    """Medians and ratios of what was measured so far."""
     median = {
         name: {unit: statistics.median(run[unit] for run in of_way) for unit in ("cpu_s", "wall_s")}
         for name, of_way in runs.items()
     }
     info = probe(source)
-    peak = json.loads((folder / "ours.json").read_text())
     return {
         "source": f"{info.duration_s:.0f} s {info.width}x{info.height} {info.frame_rate:.2f} fps {info.codec}",
-        "clips": len(clips),
+        "clips": clips,
         "encoder": EncoderSettings().model_dump(),
         "machine": {"cpus": os.cpu_count(), "load": os.getloadavg()[0], "processor": platform.machine()},
         "versions": {"av": av.__version__, "ffmpeg": ffmpeg_version()},
