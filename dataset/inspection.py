@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dataset.loader import Sample
+from dataset.loader import Sample, ShardDataset
 from dataset.receipts import Receipt, read_receipts, reason_counts
 from dataset.selection import ClipRow, read_selection
 from dataset.shards import read_shard_index
@@ -137,6 +137,23 @@ def clip_verdict(job: Path, key: str) -> ClipRow:
             return row
     near = ", ".join(row.key for row in rows[:3]) or "none"
     raise DataError(f"{job}: has no clip {key!r}; keys are <video_id>_<start_frame>, such as {near}")
+
+
+def find_sample(job: Path, key: str | None = None) -> Sample:
+    """A packed clip, of either split; the first one if no key is given.
+
+    Raises:
+        DataError: no such clip, or none at all; the message says what became of it.
+    """
+    datasets = [ShardDataset(job, split) for split in ("train", "val")]
+    for dataset in datasets:
+        if key in dataset.keys or (key is None and len(dataset)):
+            return dataset.sample(key or dataset.keys[0])
+    if key is not None and (job / "selection.parquet").is_file():
+        row, rendered = clip_verdict(job, key), read_receipts(job, "render").get(key)
+        reason = row.reason or (rendered and (rendered.reason or rendered.message)) or "it is not packed yet"
+        raise DataError(f"{key}: is not in the shards: {reason}; `animatic status {job}` says more")
+    raise DataError(f"{job}: has no clip {key or ''!r}; `animatic inspect {job}` says what there is")
 
 
 def clip_record(sample: Sample) -> dict[str, Any]:

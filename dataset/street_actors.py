@@ -13,7 +13,7 @@ from dataset.street_traffic import CarActor, PersonActor
 from labeling.camera import invert, rigid
 from labeling.schemas import Category
 
-_SMALL_PX2 = 0.25
+_SMALL_PX2 = 1.5
 _FOCAL_HINT_PX = 1056.0
 _SKY_LIGHT = np.array([150.0, 172.0, 196.0])
 

@@ -9,6 +9,7 @@ import functools
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numba
 import numpy as np
 from scipy.spatial import ConvexHull
 
@@ -357,19 +358,29 @@ def hidden_by_itself(model: CarModel, eye: np.ndarray) -> np.ndarray:
     The segment from the eye to a point, ended 3 cm short of it, is cut with the half-spaces of each convex part
     (Cyrus and Beck 1978); a stretch of over 1 cm inside hides the point.
     """
-    ray = model.keypoints - eye
-    length = np.linalg.norm(ray, axis=1)
-    hidden = np.zeros(len(ray), bool)
+    hidden = np.zeros(len(model.keypoints), np.bool_)
     for solid in model.solids:
-        if len(solid) < 4:
-            continue
-        slope = ray @ solid[:, :3].T
-        offset = solid[:, :3] @ eye + solid[:, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            cut = -offset / slope
-        enter = np.where(slope < 0, cut, -np.inf).max(axis=1)
-        leave = np.where(slope > 0, cut, np.inf).min(axis=1)
-        outside = ((np.abs(slope) < 1e-12) & (offset > 0)).any(axis=1)
-        leave = np.minimum(leave, 1 - 0.03 / length)
-        hidden |= ~outside & ((leave - np.maximum(enter, 0)) * length > 0.01)
+        if len(solid) >= 4:
+            _mark_hidden(model.keypoints, eye, solid, hidden)
     return hidden
+
+
+@numba.njit(cache=True)
+def _mark_hidden(points, eye, solid, hidden):
+    """Set ``hidden`` where the sight line to a point runs through one convex solid (E, 4)."""
+    for p in range(len(points)):
+        dx, dy, dz = points[p, 0] - eye[0], points[p, 1] - eye[1], points[p, 2] - eye[2]
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        enter, leave = 0.0, 1.0 - 0.03 / length
+        for e in range(len(solid)):
+            slope = solid[e, 0] * dx + solid[e, 1] * dy + solid[e, 2] * dz
+            offset = solid[e, 0] * eye[0] + solid[e, 1] * eye[1] + solid[e, 2] * eye[2] + solid[e, 3]
+            if abs(slope) < 1e-12:
+                if offset > 0:
+                    leave = -1.0
+            elif slope < 0:
+                enter = max(enter, -offset / slope)
+            else:
+                leave = min(leave, -offset / slope)
+        if (leave - enter) * length > 0.01:
+            hidden[p] = True

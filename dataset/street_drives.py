@@ -29,6 +29,8 @@ class StreetPath:
     """(N,) float64, radians, unwrapped; 0 looks along z, positive turns right."""
     elevation: np.ndarray
     """(N,) float64, height of the ground, metres."""
+    bend: np.ndarray
+    """(N,) float64, signed curvature, 1/m, positive to the right."""
 
     @property
     def end_m(self) -> float:
@@ -50,8 +52,8 @@ class StreetPath:
 
     def curvature(self, arc_m: np.ndarray) -> np.ndarray:
         """Signed curvature, 1/m, positive to the right."""
-        slope = np.gradient(self.heading, self.step_m)
-        return np.interp((np.asarray(arc_m) - self.start_m) / self.step_m, np.arange(len(slope)), slope)
+        grid = np.arange(len(self.bend))
+        return np.interp((np.asarray(arc_m) - self.start_m) / self.step_m, grid, self.bend)
 
 
 def path_from_bends(bends: Sequence[tuple[float, float, float]], *, length_m: float) -> StreetPath:
@@ -69,7 +71,7 @@ def path_from_bends(bends: Sequence[tuple[float, float, float]], *, length_m: fl
     origin = int(round(_LEAD_IN_M / _STEP_M))
     return StreetPath(
         start_m=-_LEAD_IN_M, step_m=_STEP_M, points_xz=_about(points, heading, origin),
-        heading=heading - heading[origin], elevation=np.zeros_like(arc),
+        heading=heading - heading[origin], elevation=np.zeros_like(arc), bend=curvature,
     )  # fmt: skip
 
 
@@ -198,9 +200,10 @@ def _path_under(street: np.ndarray, height_m: float) -> tuple[StreetPath, np.nda
     arc = np.arange(0.0, length[-1], _STEP_M)
     smooth = np.stack([_smoothed(np.interp(arc, length, axis)) for axis in line.T], -1)
     tangent = np.gradient(smooth[:, [0, 2]], axis=0)
+    heading = np.unwrap(np.arctan2(tangent[:, 0], tangent[:, 1]))
     path = StreetPath(
-        start_m=0.0, step_m=_STEP_M, points_xz=smooth[:, [0, 2]],
-        heading=np.unwrap(np.arctan2(tangent[:, 0], tangent[:, 1])), elevation=-smooth[:, 1],
+        start_m=0.0, step_m=_STEP_M, points_xz=smooth[:, [0, 2]], heading=heading, elevation=-smooth[:, 1],
+        bend=np.gradient(heading, _STEP_M),
     )  # fmt: skip
     nearest = 4 * np.argmin(np.linalg.norm(ground[:, None, [0, 2]] - path.points_xz[None, ::4], axis=-1), axis=1)
     ahead = np.stack([np.sin(path.heading[nearest]), np.cos(path.heading[nearest])], -1)

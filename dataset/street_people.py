@@ -7,6 +7,7 @@ not slide much.
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from dataset.street_raster import MAX_CORNERS, Polygons
@@ -233,17 +234,15 @@ def hidden_by_itself(look: PersonLook, points: np.ndarray, eye: np.ndarray) -> n
     """
     h = look.height
     hidden = np.zeros(17, bool)
-    for a, b, radius in _BONES:
-        i, j = _INDEX[a], _INDEX[b]
-        own = np.isin(np.arange(17), (i, j))
-        hidden |= ~own & _through(points[i], points[j], radius * h, points, eye)
+    for row, (a, b, radius) in enumerate(_BONES):
+        hidden |= _through(points[_INDEX[a]], points[_INDEX[b]], radius * h, points, eye) & ~_OWN[row]
     hip, chest = points[[11, 12]].mean(axis=0), points[[5, 6]].mean(axis=0)
     ahead = np.array([0.0, 0.05 * h, 0.0])
     torso = np.zeros(17, bool)
-    for offset in (-ahead, 0 * ahead, ahead):
-        torso |= _through(hip + offset * 0.8, chest + offset * 1.1, 0.052 * h, points, eye)
+    for share in (-1.0, 0.0, 1.0):
+        torso |= _through(hip + ahead * (0.8 * share), chest + ahead * (1.1 * share), 0.052 * h, points, eye)
     # Shoulders and hips lie in the torso's own edge: they are hidden only from the far side.
-    hidden |= torso & ~np.isin(np.arange(17), (5, 6, 11, 12))
+    hidden |= torso & ~_IN_TORSO
     for left, right in ((5, 6), (11, 12)):
         across = (points[left] - points[right]) @ (eye - points[[left, right]].mean(axis=0))
         share = across / np.linalg.norm(points[left] - points[right]) / np.linalg.norm(eye - points[left])
@@ -258,18 +257,25 @@ def hidden_by_itself(look: PersonLook, points: np.ndarray, eye: np.ndarray) -> n
     return hidden
 
 
-def _through(a: np.ndarray, b: np.ndarray, radius: float, points: np.ndarray, eye: np.ndarray) -> np.ndarray:
+_OWN = np.array([[name in bone[:2] for name in COCO17_NAMES] for bone in _BONES])
+_IN_TORSO = np.array([name.endswith(("shoulder", "hip")) for name in COCO17_NAMES])
+
+
+@numba.njit(cache=True)
+def _through(a, b, radius, points, eye):
     """(n,) bool: the segment from ``eye`` to each of (n, 3) points passes within ``radius`` of the bone a-b, in front.
 
     Closest approach of two segments (Ericson 2004, section 5.1.9), the sight line taken as a line.
     """
-    sight, bone = points - eye, b - a
-    offset = eye - a
-    ss, bb = np.einsum("ij,ij->i", sight, sight), float(bone @ bone)
-    sb, so, bo = sight @ bone, sight @ offset, float(bone @ offset)
-    denominator = np.maximum(ss * bb - sb * sb, 1e-12)
-    t = np.clip((bo * ss - so * sb) / denominator, 0, 1)
-    s = (t * sb - so) / ss
-    gap = np.linalg.norm(offset + sight * s[:, None] - bone * t[:, None], axis=1)
-    front = (1 - s) * np.sqrt(ss)
-    return (gap < radius) & (front > radius + 0.03) & (s > 0)
+    out = np.zeros(len(points), np.bool_)
+    bone, offset = b - a, eye - a
+    bb, bo = (bone * bone).sum(), (bone * offset).sum()
+    for p in range(len(points)):
+        sight = points[p] - eye
+        ss, sb, so = (sight * sight).sum(), (sight * bone).sum(), (sight * offset).sum()
+        t = min(1.0, max(0.0, (bo * ss - so * sb) / max(ss * bb - sb * sb, 1e-12)))
+        s = (t * sb - so) / ss
+        gap = offset + sight * s - bone * t
+        front = (1.0 - s) * np.sqrt(ss)
+        out[p] = (gap * gap).sum() < radius * radius and front > radius + 0.03 and s > 0
+    return out

@@ -70,14 +70,19 @@ def make_polygons(
     grow_px: float = 0.0,
     fog: float = 1.0,
 ) -> Polygons:
-    """Polygons from a list of (n, 3) corner arrays; every other argument is one value or one per polygon."""
+    """Polygons from a list of (n, 3) corner arrays, or from (N, n, 3); every other argument is one value or one per polygon."""
     count = len(corners)
     padded = np.zeros((count, MAX_CORNERS, 3), np.float32)
-    for row, polygon in zip(padded, corners, strict=True):
-        row[: len(polygon)] = polygon
+    if isinstance(corners, np.ndarray):
+        padded[:, : corners.shape[1]] = corners
+        numbers = np.full(count, corners.shape[1], np.int32)
+    else:
+        numbers = np.array([len(polygon) for polygon in corners], np.int32).reshape(count)
+        for row, polygon in zip(padded, corners, strict=True):
+            row[: len(polygon)] = polygon
     return Polygons(
         corners=padded,
-        corner_count=np.array([len(polygon) for polygon in corners], np.int32).reshape(count),
+        corner_count=numbers,
         colour=np.broadcast_to(np.asarray(colour, np.float32), (count, 3)).copy(),
         texture=np.broadcast_to(np.asarray(texture, np.int32), (count,)).copy(),
         gradient=np.broadcast_to(

@@ -352,13 +352,10 @@ def _blob(centre: np.ndarray, radius: float, rng: np.random.Generator, sun: np.n
     size = radius * rng.uniform(0.86, 1.1, (rows + 1, around))
     size[0], size[-1] = size[0, 0], size[-1, 0]
     nodes = centre + nodes * size[..., None]
-    triangles = []
-    for row in range(rows):
-        for k in range(around):
-            a, b = nodes[row, k], nodes[row, (k + 1) % around]
-            c, d = nodes[row + 1, (k + 1) % around], nodes[row + 1, k]
-            triangles += [[a, b, c]] * (row > 0) + [[a, c, d]] * (row < rows - 1)
-    faces = np.array(triangles)
+    after = np.roll(nodes, -1, axis=1)
+    upper = np.stack([nodes[1:-1], after[1:-1], after[2:]], axis=2)
+    lower = np.stack([nodes[:-2], after[1:-1], nodes[1:-1]], axis=2)
+    faces = np.concatenate([upper.reshape(-1, 3, 3), lower.reshape(-1, 3, 3)])
     normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     inward = np.einsum("ij,ij->i", normal, faces.mean(axis=1) - centre) < 0
     faces[inward] = faces[inward][:, ::-1]
@@ -373,7 +370,7 @@ def _blob(centre: np.ndarray, radius: float, rng: np.random.Generator, sun: np.n
     gradient[:, 0, :3], gradient[:, 1, :3] = across * per_m, np.cross(normal, across) * per_m
     gradient[:, :, 3] = -np.einsum("nij,j->ni", gradient[:, :, :3], centre) + rng.uniform(0, 256, (1, 2))
     return make_polygons(
-        list(faces), colour=green * shade[:, None], texture=texture_index("leaves"), gradient=gradient, grow_px=0.4
+        faces, colour=green * shade[:, None], texture=texture_index("leaves"), gradient=gradient, grow_px=0.4
     )
 
 

@@ -1,5 +1,6 @@
 """The synthetic street: random access, exact labels, flow that a tracker confirms, and drives that do what they say."""
 
+import functools
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,12 @@ def small(scenario: Scenario = "drive", *, seed: int = 3, frames: int = 48, **op
     return StreetConfig(seed=seed, width=352, height=234, frames=frames, scenario=scenario, **options)
 
 
+@functools.cache
+def small_street(scenario: Scenario = "drive") -> Street:
+    """A street that several tests look at."""
+    return Street(small(scenario, frames=121))
+
+
 def test_a_frame_depends_on_nothing_but_its_number() -> None:
     forwards, backwards = Street(small()), Street(small())
     first = [forwards.render(i) for i in (5, 17, 40)]
@@ -38,7 +45,7 @@ def test_another_seed_is_another_street() -> None:
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_every_scenario_renders_with_valid_labels(scenario: Scenario) -> None:
-    street = Street(small(scenario))
+    street = small_street(scenario)
     frame = street.render(30)
     assert frame.rgb.shape == (234, 352, 3)
     assert frame.rgb.std() > 15
@@ -89,9 +96,9 @@ def test_depth_of_the_ground_is_that_of_a_plane() -> None:
 
 
 def test_flow_to_itself_is_zero_and_the_sky_only_turns() -> None:
-    street = Street(small("turn"))
+    street = small_street("turn")
     assert np.abs(street.flow(4, 4)).max() < 1e-3
-    drive = Street(small("fast"))
+    drive = small_street("fast")
     sky = np.isinf(drive.depth(2))
     assert np.abs(drive.flow(2, 9)[sky]).max() < 1e-3
 
@@ -143,7 +150,7 @@ def test_wheels_are_dark_and_rear_plates_light_where_the_labels_say() -> None:
 
 
 def test_somebody_who_passes_behind_the_column_is_gone_for_about_a_second() -> None:
-    street = Street(small("crossing", frames=120))
+    street = small_street("crossing")
     shares = {}
     for i in range(0, 120, 2):
         for thing in street.render(i).objects:
@@ -174,19 +181,19 @@ def test_lane_points_run_from_near_to_far_along_the_paint() -> None:
 
 @pytest.mark.parametrize("scenario", ["still", "crossing", "lead_leaves", "cross_traffic"])
 def test_a_still_camera_stands_still(scenario: Scenario) -> None:
-    assert Street(small(scenario)).trajectory.path_length_m == 0.0
+    assert small_street(scenario).trajectory.path_length_m == 0.0
 
 
 def test_drives_do_what_their_scenario_says() -> None:
-    turn = Street(small("turn")).trajectory
+    turn = small_street("turn").trajectory
     assert turn.path_length_m == 0.0
     assert rotation_angle_deg(turn.cam_to_world[24, :3, :3]) == pytest.approx(30.0)
-    assert Street(small("reverse")).trajectory.positions[-1, 2] < -3
-    assert Street(small("crawl")).trajectory.path_length_m == pytest.approx(0.5 * 47 / 24)
-    assert Street(small("fast")).trajectory.positions[24, 2] == pytest.approx(30.0)
-    sharp = Street(small("sharp_turn", frames=121)).trajectory
+    assert small_street("reverse").trajectory.positions[-1, 2] < -3
+    assert small_street("crawl").trajectory.path_length_m == pytest.approx(2.5)
+    assert small_street("fast").trajectory.positions[24, 2] == pytest.approx(30.0)
+    sharp = small_street("sharp_turn").trajectory
     assert rotation_angle_deg(sharp.cam_to_world[-1, :3, :3]) == pytest.approx(90.0, abs=2)
-    speeds = np.linalg.norm(np.diff(Street(small("stop_and_go", frames=240)).trajectory.positions, axis=0), axis=1) * 24
+    speeds = np.linalg.norm(np.diff(small_street("stop_and_go").trajectory.positions, axis=0), axis=1) * 24
     assert speeds.max() > 5 and (speeds < 1e-9).sum() > 20
 
 
