@@ -187,6 +187,10 @@ class Engine:
                 return
 
     def _hand_out(self, waiting: deque[Task]) -> None:
+        # A worker that died while it waited is nobody's fault: it must not count against the item it would get.
+        for worker in [worker for worker in self._workers if worker.task is None and not worker.process.is_alive()]:
+            worker.stop()
+            self._workers.remove(worker)
         while len(self._workers) < self._count and len(self._workers) < len(waiting) + self._busy:
             self._workers.append(_Worker(self._root))
         for worker in self._workers:

@@ -9,7 +9,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from dataset.inspection import Spread, Summary, clip_record, clip_verdict, summarize, write_contact_sheet
+from dataset.inspection import Spread, Summary, clip_record, find_sample, summarize, write_contact_sheet
 from dataset.loader import ShardDataset
 from dataset.receipts import read_receipts, reason_counts
 from dataset.selection import read_selection
@@ -172,7 +172,7 @@ def inspect(root: Path, key: str | None, *, sheet: Path | None = None, as_json: 
         summary = summarize(root)
         print_json(asdict(summary)) if as_json else _print_summary(root, summary)
         return 0
-    sample = _find_sample(root, key)
+    sample = find_sample(root, key)
     if sheet is not None:
         write_contact_sheet(sample, sheet)
     record = clip_record(sample)
@@ -188,19 +188,6 @@ def inspect(root: Path, key: str | None, *, sheet: Path | None = None, as_json: 
 def _some_key(root: Path) -> str:
     keys = [key for split in ("train", "val") for key in ShardDataset(root, split).keys]
     return keys[0] if keys else "<video_id>_<start_frame>"
-
-
-def _find_sample(root: Path, key: str) -> Any:
-    for split in ("train", "val"):
-        dataset = ShardDataset(root, split)
-        if key in dataset.keys:
-            return dataset.sample(key)
-    if (root / SELECTION).is_file():
-        row = clip_verdict(root, key)
-        dropped = read_receipts(root, "render").get(key)
-        reason = row.reason or (dropped.reason or dropped.message if dropped else "it is not packed yet")
-        raise DataError(f"{key}: is not in the shards: {reason}; `animatic status {root}` says more")
-    raise DataError(f"{root}: has no clip {key!r}; `animatic inspect {root}` says what there is")
 
 
 def print_json(value: Any) -> None:

@@ -1,0 +1,167 @@
+"""What ``animatic cache``, ``train`` and ``generate`` do: options to the training package, and a few lines back."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from dataset.inspection import find_sample
+from dataset.loader import Sample
+from labeling.camera import Intrinsics, rebased_trajectory
+from labeling.errors import ConfigError
+from labeling.skeleton_video import draw_skeletons
+from pipelines.console import file_size, make_console
+from pipelines.stage import parse_part
+from training.config import STAGES, Stage, load_config
+from training.dry_run import RunPlan
+from training.generation import GeneratedFiles, generate
+from training.latents import CacheSummary, cache_latents
+from training.trainer import TrainSummary, train
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GenerateOptions:
+    """Options of ``animatic generate`` that pass through as they are."""
+
+    backbone: str | None = None
+    skeleton_video: Path | None = None
+    objects: Path | None = None
+    samples: int = 1
+    seed: int = 0
+    steps: int = 30
+    guidance: float = 3.0
+    coordinates: str = "consistent"
+    frames: int | None = None
+    extractors: tuple[str, ...] | None = None
+    models_dir: Path | None = None
+    device: str | None = None
+
+
+def run_cache(
+    job: Path, *, backbone: str, part: str | None = None, object_variants: int = 1, device: str = "cpu",
+    refresh: bool = False, picture: Mapping[str, Any] | None = None,
+) -> CacheSummary:  # fmt: skip
+    """Cache a job's latents, with a bar.
+
+    Raises:
+        AnimaticError: as ``cache_latents``.
+    """
+    share = parse_part(part) if part else None
+    with _bar() as progress:
+        task = progress.add_task("cache", total=None)
+
+        def show(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        summary = cache_latents(
+            job, backbone_name=backbone, part=(share.index - 1, share.count) if share else (0, 1), progress=show,
+            object_variants=object_variants, device=device, refresh=refresh, picture=picture,
+        )  # fmt: skip
+    make_console().print(
+        f"{summary.made} clips encoded, {summary.kept} were there, {summary.captions} captions, "
+        f"{file_size(summary.bytes)} in {summary.folder}"
+    )
+    return summary
+
+
+def run_train(
+    stage: str, *, data: Path, config: str, out: Path | None = None, resume: str = "auto", dry_run: bool = False,
+    steps_per_second: float | None = None, overrides: Mapping[str, Any] | None = None,
+    on_step: Callable[[int, float], None] | None = None,
+) -> TrainSummary | RunPlan:  # fmt: skip
+    """Train one adapter, or print what would be trained.
+
+    Raises:
+        ConfigError: a stage or a recipe that is not known.
+        AnimaticError: as ``train``.
+    """
+    if stage not in STAGES:
+        raise ConfigError(f"stage {stage!r} is not known; choose one of {', '.join(STAGES)}")
+    recipe = load_config(config, stage=cast(Stage, stage), overrides=overrides)
+    out = out or data / "adapters" / f"{recipe.name}_{stage}"
+    result = train(
+        recipe, data=data, out=out, resume=_resume(resume), dry_run=dry_run, steps_per_second=steps_per_second,
+        on_step=on_step, quiet=on_step is not None,
+    )  # fmt: skip
+    console = make_console()
+    if isinstance(result, RunPlan):
+        table = Table(show_header=False, box=None, pad_edge=False)
+        for name, value in result.rows():
+            table.add_row(f"[bold]{name}[/]", value)
+        console.print(table)
+    else:
+        losses = result.losses
+        course = f", loss {losses[0]:.4f} to {losses[-1]:.4f}" if losses else ""
+        console.print(f"{stage}: {result.steps} steps{course}; {result.adapter}")
+    return result
+
+
+def _resume(text: str) -> Any:
+    return text if text in ("auto", "never") else Path(text)
+
+
+def run_generate(
+    *, out: Path, motion: Path | None, appearance: Path | None, end_to_end: Path | None = None,
+    image: Path | None = None, caption: str | None = None, skeleton: Path | None = None, ego: str | None = None,
+    data: Path | None = None, clip: str | None = None, options: GenerateOptions | None = None,
+) -> list[GeneratedFiles]:  # fmt: skip
+    """Generate from a picture and a text, or from a clip of a job: its first frame, caption, skeletons and trajectory.
+
+    Raises:
+        ConfigError: neither a picture nor a clip, or no adapter.
+        AnimaticError: as ``generate``.
+    """
+    options = options or GenerateOptions()
+    if data is not None:
+        sample = find_sample(data, clip)
+        conditions = clip_conditions(sample, with_ego=ego is None)
+    elif image is not None and caption is not None:
+        conditions = {"image": image, "caption": caption, "skeleton": skeleton, "name": image.stem}
+    else:
+        raise ConfigError("nothing to start from; give --image FILE and --caption TEXT, or --data JOB [--clip KEY]")
+    if caption is not None:
+        conditions["caption"] = caption
+    if ego is not None:
+        conditions["ego"] = ego
+    files = generate(
+        **conditions, out=out, motion=motion, appearance=appearance, end_to_end=end_to_end,
+        backbone=options.backbone, skeleton_video=options.skeleton_video, objects=options.objects,
+        samples=options.samples, seed=options.seed, steps=options.steps, guidance=options.guidance,
+        coordinates=options.coordinates, frames=options.frames, extractors=options.extractors,
+        models_dir=options.models_dir, device=options.device,
+    )  # fmt: skip
+    console = make_console()
+    for made in files:
+        console.print(" ".join(str(path) for path in (made.control, made.rgb) if path is not None))
+    return files
+
+
+def clip_conditions(sample: Sample, *, with_ego: bool = True) -> dict[str, Any]:
+    """What a clip of a job is generated from: its first frame, caption, first skeletons, trajectory and camera."""
+    meta = sample.meta
+    picture = meta["picture"]
+    first = [label for label in sample.keypoints() if label.frame == 0]
+    intrinsics = Intrinsics(**meta["intrinsics"])
+    conditions: dict[str, Any] = {
+        "image": next(sample.iterate_frames("rgb.mp4")), "caption": sample.caption, "name": sample.key,
+        "intrinsics": intrinsics,
+        "skeleton": draw_skeletons(
+            first, width=768, height=512, label_width=picture["width"], label_height=picture["height"]
+        ),
+    }  # fmt: skip
+    if with_ego:
+        poses = sample.cam_to_world
+        conditions["ego"] = rebased_trajectory(np.arange(len(poses)) / meta["fps"], poses)
+    return conditions
+
+
+def _bar() -> Progress:
+    console = make_console()
+    return Progress(
+        TextColumn("{task.description:>10}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn(),
+        console=console, transient=True, disable=not console.is_terminal,
+    )  # fmt: skip
