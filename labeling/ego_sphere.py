@@ -1,10 +1,10 @@
 """The checkerboard sphere around the first camera, seen from any camera inside it.
 
 A pixel's direction meets the sphere in one point, whose azimuth and polar angle are the place to look up in a raster of
-checks. The arc functions are the cost, so they are evaluated on every 8th pixel of each row and column and interpolated
-linearly between; a block that holds the seam of the azimuth or comes near a pole is evaluated at each of its pixels.
-The raster is never stored as pixels: a column and a row name their check, and the check its colour, so that a block
-inside one check is filled without a look-up.
+checks. The arc functions are the cost, so they are evaluated on every 8th pixel of each row and column (oftener in
+small pictures) and interpolated linearly between; a block that holds the seam of the azimuth or comes near a pole is
+evaluated at each of its pixels. The raster is never stored as pixels: a column and a row name their check, and the
+check its colour, so that a block inside one check is filled without a look-up.
 
 Axes are OpenCV's, in the first camera: with x right, y down, z forward, the azimuth is ``atan2(-z, x)`` and the polar
 angle ``acos(y / radius)``; the pole is the first camera's vertical.
@@ -24,7 +24,9 @@ CHECKS_AROUND, CHECKS_DOWN = 64, 32
 
 _PALETTE_SEED = 42
 _EDGE_PIXELS = 1.5
-_STEP = 8
+_LARGEST_STEP = 8
+# Pixels of focal length per pixel of step: so linear interpolation is as good in a small picture as in a large one.
+_FOCAL_PER_STEP = 60.0
 # Linear interpolation over 8 pixels is off by 0.1 pixel where a block spans this much azimuth; elsewhere by less.
 _LARGEST_TURN = 0.1 / (2 * math.pi)
 
@@ -101,7 +103,8 @@ def draw_sphere(cam_to_world: np.ndarray, *, raster: CheckRaster, lens: Lens, wi
     view = np.array([lens.fx, lens.fy, lens.cx, lens.cy])
     size = np.array([len(raster.columns) - 2, len(raster.rows) - 2], np.float64)
     motion = np.ascontiguousarray(cam_to_world, dtype=np.float64)
-    _draw_blocks(picture, motion, view, size, raster.columns, raster.rows, raster.palette, raster.rounding)
+    step = int(min(max(2, min(lens.fx, lens.fy) // _FOCAL_PER_STEP), _LARGEST_STEP))
+    _draw_blocks(picture, step, motion, view, size, raster.columns, raster.rows, raster.palette, raster.rounding)
     return picture
 
 
@@ -163,14 +166,14 @@ def _spread(near, far, i, axis):  # pragma: no cover - compiled
 
 @njit(cache=True, error_model="numpy")
 def _fill_linear(
-    picture, x0, y0, x1, y1, near, far, i, columns, rows, palette, rounding
+    picture, step, x0, y0, x1, y1, near, far, i, columns, rows, palette, rounding
 ):  # pragma: no cover - compiled
     """One block with coordinates linear between its corners."""
     for y in range(y0, y1):
-        down = (y - y0) / _STEP
+        down = (y - y0) / step
         u, v = near[i, 0] + (far[i, 0] - near[i, 0]) * down, near[i, 1] + (far[i, 1] - near[i, 1]) * down
-        step_u = (near[i + 1, 0] + (far[i + 1, 0] - near[i + 1, 0]) * down - u) / _STEP
-        step_v = (near[i + 1, 1] + (far[i + 1, 1] - near[i + 1, 1]) * down - v) / _STEP
+        step_u = (near[i + 1, 0] + (far[i + 1, 0] - near[i + 1, 0]) * down - u) / step
+        step_v = (near[i + 1, 1] + (far[i + 1, 1] - near[i + 1, 1]) * down - v) / step
         for x in range(x0, x1):
             _put(picture, y, x, u + (x - x0) * step_u, v + (x - x0) * step_v, columns, rows, palette, rounding)
 
@@ -193,18 +196,18 @@ def _fill_exact(
 
 
 @njit(cache=True, error_model="numpy")
-def _draw_blocks(picture, motion, view, size, columns, rows, palette, rounding):  # pragma: no cover - compiled
+def _draw_blocks(picture, step, motion, view, size, columns, rows, palette, rounding):  # pragma: no cover - compiled
     height, width = picture.shape[:2]
-    across, down = (width + _STEP - 1) // _STEP, (height + _STEP - 1) // _STEP
+    across, down = (width + step - 1) // step, (height + step - 1) // step
     near, far = np.empty((across + 1, 2)), np.empty((across + 1, 2))
     for i in range(across + 1):
-        near[i, 0], near[i, 1] = _texel(float(i * _STEP), 0.0, motion, view, size)
+        near[i, 0], near[i, 1] = _texel(float(i * step), 0.0, motion, view, size)
     for j in range(down):
-        y0, y1 = j * _STEP, min((j + 1) * _STEP, height)
+        y0, y1 = j * step, min((j + 1) * step, height)
         for i in range(across + 1):
-            far[i, 0], far[i, 1] = _texel(float(i * _STEP), float(y0 + _STEP), motion, view, size)
+            far[i, 0], far[i, 1] = _texel(float(i * step), float(y0 + step), motion, view, size)
         for i in range(across):
-            x0, x1 = i * _STEP, min((i + 1) * _STEP, width)
+            x0, x1 = i * step, min((i + 1) * step, width)
             low_u, high_u = _spread(near, far, i, 0)
             low_v, high_v = _spread(near, far, i, 1)
             if high_u - low_u > _LARGEST_TURN * size[0]:
@@ -216,5 +219,5 @@ def _draw_blocks(picture, motion, view, size, columns, rows, palette, rounding):
                 red, green, blue = palette[column, row, 0], palette[column, row, 1], palette[column, row, 2]
                 _fill_flat(picture, x0, y0, x1, y1, red, green, blue)
             else:
-                _fill_linear(picture, x0, y0, x1, y1, near, far, i, columns, rows, palette, rounding)
+                _fill_linear(picture, step, x0, y0, x1, y1, near, far, i, columns, rows, palette, rounding)
         near, far = far, near

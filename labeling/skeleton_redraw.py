@@ -31,8 +31,10 @@ def redrawn_points(
     car = _Car(schema, places, radii)
     for point in [*unsure] * _ROUNDS:
         car.move(parts, point)
+    # A point explains at least half a dot of its own, or nothing tells it from a wrong one.
+    least = math.pi * radii[1] ** 2 / 2
     for _ in range(_ROUNDS):
-        idle = [point for point in car.present() if car.gain(parts, point) <= 0]
+        idle = [point for point in car.present() if car.gain(parts, point) < least]
         if not idle:
             break
         car.shown[idle] = False

@@ -11,10 +11,12 @@ _LEFT = """-.5 .78 2.15  -.5 .62 2.2  -.82 .8 1.9  -.85 .65 1.95  -.85 .5 2.0  -
 -.6 1.4 .3  -.8 .95 .95  -.9 .3 .95  -.62 1.42 -.1  -.85 .92 -.1  -.9 .8 .2  -.9 .8 .02  -.9 .28 -.1  -.75 .95 -1.25
 -.9 .8 -.75  -.9 .8 -.95  -.9 .3 -.95  -.9 .32 -1.35  -.88 .3 -1.75  -.8 .9 -1.9  -.85 .7 -1.95  -.58 1.38 -.95
 -.55 .9 -2.1  -.55 .7 -2.15  -.5 .5 -2.2  -.85 .4 -2.1"""
-_PLATES = """.25 .5 2.25  -.25 .5 2.25  .25 .38 2.25  -.25 .38 2.25  -.25 .8 -2.2  .25 .8 -2.2  .25 .65 -2.2  -.25 .65 -2.2"""
+_PLATES = (
+    """.25 .5 2.25  -.25 .5 2.25  .25 .38 2.25  -.25 .38 2.25  -.25 .8 -2.2  .25 .8 -2.2  .25 .65 -2.2  -.25 .65 -2.2"""
+)
 # 17 COCO joints of a person mid-stride, metres: to the right, up.
-_JOINTS = """0 1.6  .03 1.64  -.03 1.64  .08 1.62  -.08 1.62  .2 1.4  -.2 1.4  .28 1.12  -.3 1.15  .22 .9  -.22 .92  .13 .9
--.13 .9  .2 .5  -.18 .48  .12 .06  -.3 .1"""
+_JOINTS = """0 1.6  .03 1.64  -.03 1.64  .08 1.62  -.08 1.62  .2 1.4  -.2 1.4  .28 1.12  -.3 1.15  .22 .9  -.22 .92
+.13 .9  -.13 .9  .2 .5  -.18 .48  .12 .06  -.3 .1"""
 
 
 def _numbers(text: str, columns: int) -> np.ndarray:
@@ -39,8 +41,8 @@ def label(category, schema: str, points: np.ndarray, *, frame: int = 0, track_id
 
 
 def car(
-    *, right_m: float = 0.0, ahead_m: float = 12.0, heading_deg: float = 0.0, schema: str = "car66", camera_m: float = 1.5,
-    frame: int = 0, track_id: int = 0, hide_far_side: bool = False,
+    *, right_m: float = 0.0, ahead_m: float = 12.0, heading_deg: float = 0.0, schema: str = "car66",
+    camera_m: float = 1.5, frame: int = 0, track_id: int = 0, hide_far_side: bool = False,
 ) -> Keypoints:  # fmt: skip
     """A car seen from ``camera_m`` above the road; heading 0 drives away from the camera."""
     shape = car66_shape()
@@ -59,8 +61,8 @@ def car(
 
 
 def person(
-    *, right_m: float = 0.0, ahead_m: float = 8.0, schema: str = "wholebody133", camera_m: float = 1.5, score: float = 1.0,
-    frame: int = 0, track_id: int = 0,
+    *, right_m: float = 0.0, ahead_m: float = 8.0, schema: str = "wholebody133",
+    camera_m: float = 1.5, score: float = 1.0, frame: int = 0, track_id: int = 0,
 ) -> Keypoints:  # fmt: skip
     """A person facing the camera, with hands and a face when the schema has them."""
     joints = _numbers(_JOINTS, 2)

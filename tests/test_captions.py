@@ -1,0 +1,162 @@
+"""Captions: what the template says of a clip, and the tables that texts are imported from."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from scipy.spatial.transform import Rotation
+from skeleton_fixtures import car, lane, person
+
+from labeling.camera import Trajectory, rebased_trajectory, rigid
+from labeling.captions import camera_motion, read_caption_table, template_caption
+from labeling.errors import DataError
+
+FRAMES = 121
+
+
+def _drive(*, speed: float = 0.0, yaw_deg: float = 0.0, frames: int = FRAMES, jitter_m: float = 0.0) -> Trajectory:
+    """An arc at a steady speed that turns by ``yaw_deg`` in all, to the right if positive."""
+    times = np.arange(frames) / 24
+    yaw = np.radians(np.linspace(0, yaw_deg, frames))
+    steps = speed / 24 * np.column_stack([np.sin(yaw), np.zeros(frames), np.cos(yaw)])
+    positions = np.concatenate([np.zeros((1, 3)), np.cumsum(steps[:-1], axis=0)])
+    positions = positions + np.random.default_rng(0).normal(0, jitter_m, positions.shape)
+    return rebased_trajectory(times, rigid(Rotation.from_euler("y", yaw[:, None]).as_matrix(), positions))
+
+
+def _clip(*, cars: int = 0, people: int = 0, frames: range = range(FRAMES)) -> list:
+    labels = [car(frame=f, track_id=i) for f in frames for i in range(cars)]
+    return labels + [person(frame=f, track_id=50 + i, schema="coco17") for f in frames for i in range(people)]
+
+
+def test_the_designs_example():
+    caption = template_caption(_clip(cars=3, people=1), _drive(speed=13))
+    assert caption == "A road with 3 cars and 1 person ahead; the camera drives forward at 13 m/s."
+
+
+@pytest.mark.parametrize(
+    "cars,people,scene",
+    [
+        (0, 0, "An empty road"),
+        (1, 0, "A road with 1 car ahead"),
+        (0, 2, "A road with 2 people ahead"),
+        (2, 3, "A road with 2 cars and 3 people ahead"),
+    ],
+    ids=str,
+)
+def test_objects_are_counted(cars, people, scene):
+    assert template_caption(_clip(cars=cars, people=people), _drive(speed=5)).startswith(scene + ";")
+
+
+def test_an_object_counts_when_in_view_for_a_quarter_of_the_clip():
+    brief, long = _clip(cars=1, frames=range(30)), _clip(cars=1, frames=range(31))
+    assert template_caption(brief, _drive()).startswith("An empty road")
+    assert template_caption(long, _drive()).startswith("A road with 1 car ")
+
+
+def test_an_id_switch_adds_no_car_and_lanes_are_no_objects():
+    labels = [car(frame=f, track_id=f) for f in range(FRAMES)] + [lane(frame=f) for f in range(FRAMES)]
+    assert template_caption(labels, _drive()).startswith("A road with 1 car ahead")
+
+
+@pytest.mark.parametrize(
+    "drive,words",
+    [
+        ({"speed": 13}, "drives forward at 13 m/s"),
+        ({"speed": 1.2}, "drives forward at 1.2 m/s"),
+        ({"speed": 8, "yaw_deg": 60}, "drives forward at 8 m/s, turning right"),
+        ({"speed": 8, "yaw_deg": -60}, "drives forward at 8 m/s, turning left"),
+        ({"speed": 8, "yaw_deg": 4}, "drives forward at 8 m/s"),
+        ({"speed": -3}, "reverses at 3 m/s"),
+        ({}, "stands still"),
+        ({"jitter_m": 0.02}, "stands still"),
+        ({"yaw_deg": -90}, "turns left on the spot"),
+        ({"speed": 6, "yaw_deg": 300}, "drives forward at 6 m/s, turning right"),
+        ({"frames": 1}, ""),
+    ],
+    ids=str,
+)
+def test_the_cameras_motion_in_words(drive, words):
+    assert camera_motion(_drive(**drive)) == words
+
+
+def test_without_a_trajectory_the_caption_is_silent_about_the_camera():
+    assert template_caption(_clip(cars=2)) == "A road with 2 cars ahead."
+    assert template_caption([]) == "An empty road."
+
+
+# Tables
+
+ROWS = [{"key": "a_0", "text": "A wet road, two lanes."}, {"key": "b_48", "text": 'A "quoted" sign;\nänd a newline'}]
+
+
+def _write(path, rows=ROWS):
+    if path.suffix == ".parquet":
+        pq.write_table(pa.Table.from_pylist(rows), path)
+    elif path.suffix == ".jsonl":
+        path.write_text("\n".join(json.dumps(row) for row in rows) + "\n\n", encoding="utf-8")
+    else:
+        names = list(rows[0]) if rows else ["key", "text"]
+        quoted = [",".join('"' + str(row[name]).replace('"', '""') + '"' for name in names) for row in rows]
+        path.write_text("\n".join([",".join(names), *quoted]) + "\n", encoding="utf-8")
+    return path
+
+
+KINDS = ["captions.csv", "captions.parquet", "captions.jsonl", "CAPTIONS.CSV"]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_tables_of_every_kind_give_the_same_texts(tmp_path, name):
+    assert read_caption_table(_write(tmp_path / name)) == {row["key"]: row["text"] for row in ROWS}
+
+
+@pytest.mark.parametrize("name", KINDS[:3])
+@pytest.mark.parametrize(
+    "rows,message",
+    [
+        ([{"key": "a_0", "caption": "x"}], "row 1 has no column 'text'"),
+        ([ROWS[0], {"key": "", "text": "x"}], "row 2 has key '' and text 'x'"),
+        ([ROWS[0], {"key": "c_0", "text": "  "}], "row 2 has key 'c_0'"),
+        ([ROWS[0], ROWS[0]], "row 2 repeats the key 'a_0'"),
+        ([], "holds no captions"),
+    ],
+    ids=["column", "key", "text", "repeated", "empty"],
+)
+def test_a_table_that_cannot_be_used_says_where(tmp_path, name, rows, message):
+    with pytest.raises(DataError, match="captions") as caught:
+        read_caption_table(_write(tmp_path / name, rows))
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name,content",
+    [
+        ("c.parquet", b"not parquet"),
+        ("c.jsonl", b'{"key": '),
+        ("c.csv", b"\xff\xfe\x00"),
+        ("c.xlsx", b""),
+        ("d.csv", b""),
+    ],
+    ids=["parquet", "jsonl", "encoding", "kind", "zero bytes"],
+)
+def test_a_file_that_is_no_table_is_a_clear_error(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=name):
+        read_caption_table(path)
+
+
+def test_a_missing_table_is_a_clear_error(tmp_path):
+    for name in ("none.csv", "none.parquet", "none.jsonl"):
+        with pytest.raises(DataError, match="check the path"):
+            read_caption_table(tmp_path / name)
+
+
+@pytest.mark.parametrize("line", ['["a_0", "text"]', '{"key": 5, "text": "x"}', "3"])
+def test_lines_that_are_no_key_and_text_are_refused(tmp_path, line):
+    path = tmp_path / "c.jsonl"
+    path.write_text(line, encoding="utf-8")
+    with pytest.raises(DataError, match="row 1"):
+        read_caption_table(path)
