@@ -32,9 +32,16 @@ class Crop:
 
     @property
     def frame_to_input(self) -> np.ndarray:
-        """(2, 3) float64 affine map from frame pixels to input pixels."""
-        scale = np.divide(self.input_xy, self.size_xy)
-        return np.column_stack([np.diag(scale), np.multiply(self.input_xy, 0.5) - scale * self.centre_xy])
+        """(2, 3) float64 affine map from frame pixels to input pixels.
+
+        From three points in float32, as MMPose makes it: ``cv2.warpAffine`` rounds places to 1/32 px, and another
+        rounding of the same map would turn one pixel in ten thousand.
+        """
+        corners = [
+            _corner(centre, width) for centre, width in
+            ((self.centre_xy, self.size_xy[0]), (np.multiply(self.input_xy, 0.5), self.input_xy[0]))
+        ]  # fmt: skip
+        return cv2.getAffineTransform(*corners)
 
     def to_frame(self, points_xy: np.ndarray) -> np.ndarray:
         """(..., 2) input pixels to frame pixels: the inverse of ``frame_to_input``."""
@@ -47,7 +54,7 @@ def plan_crop(box_xyxy: np.ndarray, card: SimccCard) -> Crop | None:
 
     None for a box without area, of which nothing can be seen.
     """
-    left, top, right, bottom = (float(value) for value in box_xyxy)
+    left, top, right, bottom = box_xyxy
     if not np.isfinite(box_xyxy).all() or right - left <= 0 or bottom - top <= 0:
         return None
     width, height = (right - left) * card.crop_padding, (bottom - top) * card.crop_padding
@@ -185,6 +192,14 @@ def _in_frame(decoded: np.ndarray, crop: Crop) -> np.ndarray:
     present = points[:, 2] > 0
     points[present, :2] = crop.to_frame(points[present, :2])
     points[:, 2] = np.minimum(points[:, 2], 1)
+    return points
+
+
+def _corner(centre_xy: Sequence[float] | np.ndarray, width: float) -> np.ndarray:
+    """(3, 2) float32: the centre, the point half a width above it, and the one half a width left of that."""
+    x, y = centre_xy
+    points = np.array([[x, y], [x, y - width * 0.5], [x, y - width * 0.5]], np.float32)
+    points[2, 0] -= points[0, 1] - points[1, 1]
     return points
 
 

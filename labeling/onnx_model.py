@@ -1,9 +1,11 @@
 """ONNX sessions that keep their card's contract: file, hash, shapes and numbers are checked, never trusted."""
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import onnxruntime
 
@@ -143,15 +145,19 @@ def check_frame(frame: np.ndarray) -> None:
 
 def network_input(picture: np.ndarray, card: ModelCard) -> np.ndarray:
     """(H, W, 3) uint8 RGB to (3, H, W) float32 in the card's channel order and normalisation."""
-    if card.channel_order == "bgr":
-        picture = picture[:, :, ::-1]
-    planes = np.ascontiguousarray(picture.transpose(2, 0, 1), dtype=np.float32)
-    mean, std = (np.asarray(value, np.float32)[:, None, None] for value in (card.mean, card.std))
-    if mean.any():
-        planes -= mean
-    if (std != 1).any():
-        planes /= std
+    planes = np.empty((3, *picture.shape[:2]), np.float32)
+    channels = cv2.split(picture)
+    order = channels[::-1] if card.channel_order == "bgr" else channels
+    for i, levels in enumerate(_levels(card.mean, card.std)):
+        planes[i] = cv2.LUT(order[i], levels)
     return planes
+
+
+@functools.lru_cache(maxsize=16)
+def _levels(mean: tuple[float, float, float], std: tuple[float, float, float]) -> np.ndarray:
+    """(3, 256) float32: what each level of each channel becomes, rounded once."""
+    values = (np.arange(256) - np.array(mean)[:, None]) / np.array(std)[:, None]
+    return values.astype(np.float32)
 
 
 def _open_session(path: Path, providers: list[str], threads: int) -> onnxruntime.InferenceSession:

@@ -49,8 +49,8 @@ def test_to_frame_inverts_the_crop(box: tuple[float, ...]) -> None:
     assert crop is not None
     points = np.random.default_rng(0).uniform(-50, 700, (30, 2))
     there = points @ crop.frame_to_input[:, :2].T + crop.frame_to_input[:, 2]
-    np.testing.assert_allclose(crop.to_frame(there), points, atol=1e-9)
-    np.testing.assert_allclose(crop.frame_to_input @ [*crop.centre_xy, 1], [WIDTH / 2, HEIGHT / 2], atol=1e-9)
+    np.testing.assert_allclose(crop.to_frame(there), points, atol=1e-3)
+    np.testing.assert_allclose(crop.frame_to_input @ [*crop.centre_xy, 1], [WIDTH / 2, HEIGHT / 2], atol=1e-3)
 
 
 @pytest.mark.parametrize(

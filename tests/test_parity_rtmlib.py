@@ -120,13 +120,14 @@ def test_raw_responses_agree_and_the_two_scores_follow_from_them(real_data: Path
     crop = plan_crop(box, head.card)
     assert crop is not None
     mine = head.model.run(crop_input(frame, crop, head.card)[None])
-    picture, centre, scale = peer.preprocess(frame, box.tolist())
+    picture, centre, scale = peer.preprocess(frame, list(box))
+    np.testing.assert_array_equal(crop_input(frame, crop, head.card).transpose(1, 2, 0), picture.astype(np.float32))
     np.testing.assert_allclose(scale, crop.size_xy, rtol=1e-6)
     np.testing.assert_allclose(centre, crop.centre_xy, rtol=1e-6)
     theirs = peer.inference(picture)
     for ours, other in zip(mine, theirs, strict=True):
-        np.testing.assert_allclose(ours, np.asarray(other), atol=2e-3)
-    (points,), (_, scores) = head.estimate([frame], [box[None]]), peer(frame, [box.tolist()])
+        np.testing.assert_allclose(ours, np.asarray(other), atol=1e-5)
+    (points,), (_, scores) = head.estimate([frame], [box[None]]), peer(frame, [box])
     maxima = np.stack([response.max(axis=-1) for response in mine])
     np.testing.assert_allclose(points[..., 2], np.clip(maxima.min(axis=0), 0, 1), atol=1e-5)
     positive = scores > 0
