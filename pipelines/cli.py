@@ -174,6 +174,16 @@ def inspect(
     raise typer.Exit(inspect_job(job, key, sheet=sheet, as_json=as_json))
 
 
+@app.command(rich_help_panel=LOOK)
+def report(
+    job: JobFolder, out: Annotated[Path | None, typer.Option("--out", "-o", help="By default JOB/report.html.")] = None
+) -> None:  # fmt: skip
+    """One self-contained page: a clip in its videos, selection, trajectories, stages, failures."""
+    from pipelines.report import write_report
+
+    print(write_report(job, out=out))
+
+
 models_app = typer.Typer()
 app.add_typer(models_app, name="models", rich_help_panel=LOOK)
 
@@ -297,3 +307,27 @@ def generate(
         out=out, motion=motion, appearance=appearance, end_to_end=end_to_end, image=image, caption=caption,
         skeleton=skeleton, ego=ego, data=data, clip=clip, options=options,
     )  # fmt: skip
+
+
+@app.command(rich_help_panel=MEASURE)
+def chart(
+    stage: Annotated[str, typer.Argument(help="Which chart; an unknown name lists them.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for chart-<stage>.json and .png.")] = Path("charts"),
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer runs on less data.")] = False,
+) -> None:
+    """Speed against accuracy: a stage's methods side by side, with the Pareto front."""
+    from pipelines.measure import show_chart
+
+    raise typer.Exit(show_chart(stage, out=out, quick=quick))
+
+
+@app.command(rich_help_panel=MEASURE)
+def stability(
+    stage: Annotated[str, typer.Argument(help="Which stage; an unknown name lists them.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the table.")] = Path("charts"),
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer runs on less data.")] = False,
+) -> None:
+    """Where methods fail: named scenarios, a bound each, held or not."""
+    from pipelines.measure import show_stability
+
+    raise typer.Exit(show_stability(stage, out=out, quick=quick))
