@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -48,8 +49,9 @@ def answer(transformer: torch.nn.Module) -> torch.Tensor:
 
 def stock_pipeline() -> LTXPipeline:
     tokenizer, encoder = tiny_text()
+    text: Any = encoder
     return LTXPipeline(
-        scheduler=FlowMatchEulerDiscreteScheduler(), vae=tiny_vae(), text_encoder=encoder, tokenizer=tokenizer,
+        scheduler=FlowMatchEulerDiscreteScheduler(), vae=tiny_vae(), text_encoder=text, tokenizer=tokenizer,
         transformer=tiny_transformer(),
     )  # fmt: skip
 
@@ -143,7 +145,8 @@ def test_alpha_tensors_are_honoured(tmp_path: Path) -> None:
 
 
 def test_only_the_adapter_is_trainable_and_in_float32() -> None:
-    transformer = tiny_transformer().to(torch.bfloat16)
+    transformer = tiny_transformer()
+    torch.nn.Module.to(transformer, torch.bfloat16)
     parameters = attach_adapter(transformer, "motion", AdapterConfig(rank=4))
     named = {name: one for name, one in transformer.named_parameters() if one.requires_grad}
     assert {".lora_A.motion." in name or ".lora_B.motion." in name for name in named} == {True}

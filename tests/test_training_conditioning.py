@@ -16,7 +16,7 @@ from training.conditioning import (
     token_coordinates,
     unpack,
 )
-from training.flow import interpolate, sampling_sigmas
+from training.flow import Convention, interpolate, sampling_sigmas
 from training.latents import open_store
 from training.stages import stage_inputs
 
@@ -130,7 +130,8 @@ def test_training_and_sampling_feed_the_same_tokens_at_the_same_sigma(stage, tin
 
 def test_released_coordinates_change_what_the_sampler_feeds() -> None:
     inputs = motion_inputs("ego")
-    for convention, expected in (("consistent", 8 / 24), ("released", 1 / 24)):
+    expectations: dict[Convention, float] = {"consistent": 8 / 24, "released": 1 / 24}
+    for convention, expected in expectations.items():
         sequence = assemble_tokens(
             inputs, latents(3, 2, 3)[None], sigma_B=torch.ones(1), geometry=GEOMETRY, convention=convention
         )

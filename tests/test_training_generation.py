@@ -1,6 +1,7 @@
 """The two-stage generator: conditions, seeds, hand-over of latents, recipes for ego-motion, clear answers."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,13 +16,15 @@ from training.backbone import SamplingSettings, load_backbone
 from training.clip_views import clip_trajectory
 from training.config import Stage, backbone_config
 from training.ego_recipes import recipe_trajectory
-from training.generation import ClipConditions, ClipGenerator, generate
+from training.generation import ClipConditions, ClipGenerator
+from training.generation import generate as generate_files
 from training.sampling_inputs import control_clip, ego_trajectory
 from training.trainer import TrainSummary, train
 
 SAMPLE = FakeSample(key="other_0")
 IMAGE = SAMPLE.frames("rgb.mp4")[0]
 SKELETON = draw_skeletons(SAMPLE.keypoints()[:1], width=WIDTH, height=HEIGHT, label_width=WIDTH, label_height=HEIGHT)
+generate: Any = generate_files
 FAST = SamplingSettings(steps=2, guidance=3.0)
 
 
@@ -43,7 +46,7 @@ def generator(adapters: dict[Stage, Path]) -> ClipGenerator:
     return ClipGenerator(backbone, motion=adapters["motion"], appearance=adapters["appearance"])
 
 
-def two_stages(adapters: dict[Stage, Path]) -> dict[str, Path]:
+def two_stages(adapters: dict[Stage, Path]) -> dict[str, Any]:
     return {"motion": adapters["motion"], "appearance": adapters["appearance"]}
 
 
@@ -84,9 +87,15 @@ def test_the_motion_latents_pass_to_the_appearance_stage_undecoded(generator, mo
 def test_conditions_change_the_sample_and_their_absence_is_a_condition_too(generator) -> None:
     black = np.zeros((9, HEIGHT, WIDTH, 3), np.uint8)
     bright = np.full_like(black, 200)
-    plain = {"image": IMAGE, "caption": "A road.", "first_control": SKELETON}
-    variants = [{}, {"ego": bright}, {"objects": bright}, {"ego": bright, "objects": black}, {"caption": "Night."}]
-    clips = [generator.sample(ClipConditions(**plain | extra), settings=FAST).control for extra in variants]
+    plain: dict[str, Any] = {"image": IMAGE, "caption": "A road.", "first_control": SKELETON}
+    variants: list[dict[str, Any]] = [
+        {},
+        {"ego": bright},
+        {"objects": bright // 3},
+        {"ego": bright, "objects": black},
+        {"caption": "Night."},
+    ]
+    clips: list[Any] = [generator.sample(ClipConditions(**plain | extra), settings=FAST).control for extra in variants]
     for place, one in enumerate(clips):
         for other in clips[place + 1 :]:
             assert not np.array_equal(one, other)
@@ -96,7 +105,7 @@ def test_a_given_skeleton_video_replaces_the_motion_stage(generator, adapters) -
     video = np.stack([SKELETON] * 9)
     alone = ClipGenerator(load_backbone(generator.backbone.config), appearance=adapters["appearance"])
     conditions = ClipConditions(image=IMAGE, caption="A road.", control=video)
-    clips = [one.sample(conditions, settings=FAST) for one in (generator, alone)]
+    clips: list[Any] = [one.sample(conditions, settings=FAST) for one in (generator, alone)]
     assert np.array_equal(clips[0].control, video)
     assert np.array_equal(clips[0].rgb, clips[1].rgb)
 

@@ -206,10 +206,12 @@ def test_weights_folder_and_missing_weights(tmp_path: Path) -> None:
     tiny_vae().save_pretrained(tmp_path / "vae")
     tokenizer, encoder = tiny_text()
     tokenizer.save_pretrained(tmp_path / "tokenizer")
-    encoder.save_pretrained(tmp_path / "text_encoder")
+    text: Any = encoder
+    text.save_pretrained(tmp_path / "text_encoder")
     told = {"kind": "ltx", "size": "2b", "weights": str(tmp_path), "dtype": "float32", "picture": PICTURE}
     ours = load_backbone(backbone_config("ltx-2b", **told))
     assert ours.fingerprint() == load_backbone(backbone_config("tiny")).fingerprint()
-    assert ours.denoiser.config["num_layers"] == 2
+    denoiser: Any = ours.denoiser
+    assert denoiser.config["num_layers"] == 2
     with pytest.raises(ModelError, match="could not be loaded from"):
         load_backbone(backbone_config("ltx-2b", **{**told, "weights": str(tmp_path / "none")}), parts=["vae"])

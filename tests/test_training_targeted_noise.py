@@ -1,5 +1,7 @@
 """Targeted noise: only where skeletons are, as strong as omega says, everything else bit-equal."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -77,7 +79,7 @@ def test_stored_mask_is_lit_exactly_where_a_pixel_is(tiny_job) -> None:  # noqa:
         frames = [
             draw_skeletons([one], width=WIDTH, height=HEIGHT, label_width=WIDTH, label_height=HEIGHT) for one in labels
         ]
-        lit = np.stack(frames).any(axis=-1).reshape(9, HEIGHT // 32, 32, WIDTH // 32, 32).any(axis=(2, 4))
+        lit: Any = np.stack(frames).any(axis=-1).reshape(9, HEIGHT // 32, 32, WIDTH // 32, 32).any(axis=(2, 4))
         assert np.array_equal(store.mask(key, "skeleton").numpy(), np.stack([lit[:1].any(0), lit[1:].any(0)]))
 
 

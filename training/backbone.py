@@ -131,10 +131,14 @@ class Backbone(Protocol):
     """A video diffusion model as the rest of the framework sees it."""
 
     config: BackboneConfig
-    geometry: LatentGeometry
     device: torch.device
     adapter_prefix: str
     """Of the adapter files' keys: ``transformer`` or ``unet``."""
+
+    @property
+    def geometry(self) -> LatentGeometry:
+        """How pixels become latent cells."""
+        ...
 
     @property
     def denoiser(self) -> torch.nn.Module:

@@ -110,10 +110,10 @@ def plan_run(config: TrainConfig, *, steps_per_second: float | None = None) -> R
 def _meta_network(config: TrainConfig) -> tuple[torch.nn.Module, LatentGeometry, int, int]:
     """(network on the meta device, geometry, hidden size, blocks)."""
     if config.backbone.kind in ("svd", "tiny_svd"):
-        from training.svd import SVD_GEOMETRY, meta_unet
+        from training.svd import meta_unet, svd_geometry
 
         # The widest resolution dominates: 320 channels, about two blocks deep on each side, per latent pixel.
-        return meta_unet(config.backbone), SVD_GEOMETRY, 320, 10
+        return meta_unet(config.backbone), svd_geometry(config.backbone), 320, 10
     from diffusers.models.transformers.transformer_ltx import LTXVideoTransformer3DModel
 
     from training.ltx import TRANSFORMERS

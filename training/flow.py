@@ -62,4 +62,4 @@ def sampling_sigmas(steps: int, *, tokens: int, convention: Convention = "consis
     linear = torch.linspace(1.0, 1.0 / steps, steps)
     mu = shift_for_tokens(tokens, convention=convention)
     scheduler.set_timesteps(sigmas=linear.tolist(), mu=mu)
-    return scheduler.sigmas.float()
+    return torch.as_tensor(scheduler.sigmas, dtype=torch.float32)

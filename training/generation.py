@@ -22,6 +22,7 @@ from training.backbone import Backbone, SamplingSettings, TextEmbedding, load_ba
 from training.config import BackboneConfig, PictureConfig, Stage, backbone_config
 from training.draws import keyed_normal, keyed_seed
 from training.sampling_inputs import (
+    LabelledFrame,
     control_clip,
     covered,
     ego_clip,
@@ -233,7 +234,7 @@ def generate(
     appearance: Path | None = None,
     end_to_end: Path | None = None,
     backbone: str | Path | BackboneConfig | Backbone | None = None,
-    skeleton: Path | np.ndarray | None = None,
+    skeleton: Path | np.ndarray | LabelledFrame | None = None,
     skeleton_video: Path | None = None,
     ego: str | Path | Trajectory | None = None,
     objects: Path | None = None,
@@ -259,7 +260,7 @@ def generate(
         appearance: adapter file of the appearance stage.
         end_to_end: adapter file of the baseline, instead of both.
         backbone: preset, YAML file, configuration, or one loaded; the adapters' own if None.
-        skeleton: the first skeleton; found by the extractors if None.
+        skeleton: the first skeleton, as a picture or as labels; found by the extractors if None.
         skeleton_video: the whole skeleton video, instead of the motion stage.
         ego: a trajectory, its file, or a recipe such as ``straight 10m/s``.
         objects: object video (MP4) or labels (Parquet).
@@ -304,7 +305,8 @@ def generate(
 
 
 def prepare_conditions(
-    generator: ClipGenerator, *, image: Path | np.ndarray, caption: str, skeleton: Path | np.ndarray | None = None,
+    generator: ClipGenerator, *, image: Path | np.ndarray, caption: str,
+    skeleton: Path | np.ndarray | LabelledFrame | None = None,
     skeleton_video: Path | None = None, ego: str | Path | Trajectory | None = None, objects: Path | None = None,
     intrinsics: Intrinsics | None = None, extractors: Sequence[str] | None = None, models_dir: Path | None = None,
 ) -> ClipConditions:  # fmt: skip
@@ -312,7 +314,10 @@ def prepare_conditions(
     pixels = read_image(image) if isinstance(image, Path) else image
     stage: Stage = "motion" if "motion" in generator.files else next(iter(generator.files))
     picture, count = generator.picture(stage), generator.frame_count
-    first = read_image(skeleton) if isinstance(skeleton, Path) else skeleton
+    if isinstance(skeleton, LabelledFrame):
+        first = skeleton.drawn(picture)
+    else:
+        first = read_image(skeleton) if isinstance(skeleton, Path) else skeleton
     if first is None and stage == "motion" and skeleton_video is None:
         if generator.control_name("motion") != "skeleton":
             raise ConfigError(f"give the first {generator.control_name('motion')} frame with --skeleton FILE")

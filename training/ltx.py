@@ -41,7 +41,11 @@ class LtxBackbone(LazyParts):
     """See ``training.backbone.Backbone``."""
 
     adapter_prefix = "transformer"
-    geometry = LTX_GEOMETRY
+
+    @property
+    def geometry(self) -> LatentGeometry:
+        """32 pixels and 8 frames a cell, 128 channels."""
+        return LTX_GEOMETRY
 
     def attach(self, name: str, config: AdapterConfig) -> list[torch.nn.Parameter]:
         """A fresh trainable adapter, active; its parameters."""
@@ -80,7 +84,8 @@ class LtxBackbone(LazyParts):
         self.geometry.latent_shape(frames=frames, height=height, width=width)
         pixels = torch.from_numpy(np.ascontiguousarray(frames_THWC)).permute(3, 0, 1, 2)[None]
         pixels = pixels.to(self.device).to(self.dtype) / 127.5 - 1
-        latents = self.vae.encode(pixels).latent_dist.mode().float()
+        encoded: Any = self.vae.encode(pixels)
+        latents = encoded.latent_dist.mode().float()
         mean, std, scale = self._statistics()
         return ((latents - mean) * scale / std)[0].cpu()
 

@@ -1,6 +1,7 @@
 """What a person gives to the generator, as frames of the right size: image, first skeleton, ego and object video."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -50,6 +51,23 @@ def fitted(frames: np.ndarray, *, width: int, height: int) -> np.ndarray:
     return np.stack([cv2.resize(one, (width, height), interpolation=cv2.INTER_NEAREST) for one in frames])
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LabelledFrame:
+    """The keypoints of the first frame, to be drawn at whatever size the backbone takes."""
+
+    labels: Sequence[Keypoints]
+    width: int
+    """Of the picture that the labels are in, pixels."""
+    height: int
+
+    def drawn(self, picture: PictureConfig) -> np.ndarray:
+        """(H, W, 3) at the controls' size."""
+        return draw_skeletons(
+            self.labels, width=picture.control_width, height=picture.control_height, label_width=self.width,
+            label_height=self.height,
+        )  # fmt: skip
+
+
 def first_skeleton(
     image: np.ndarray,
     *,
@@ -81,9 +99,7 @@ def first_skeleton(
     seen = covered(image, width=LABEL_WIDTH, height=height)
     looks = looks_of(Extractors(choice, models_dir=models_dir))
     labels: list[Keypoints] = [label for look in looks for label in look.see(seen, 0)]
-    return draw_skeletons(
-        labels, width=picture.control_width, height=picture.control_height, label_width=LABEL_WIDTH, label_height=height
-    )
+    return LabelledFrame(labels=labels, width=LABEL_WIDTH, height=height).drawn(picture)
 
 
 def ego_trajectory(source: str | Path | Trajectory, *, frames: int, fps: float) -> Trajectory:

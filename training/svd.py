@@ -11,6 +11,7 @@ log s ~ N(0.7, 1.6).
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +91,8 @@ class SvdBackbone(LazyParts):
 
     @property
     def geometry(self) -> LatentGeometry:
-        """The tiny network halves its latents once, the real one three times."""
-        tiny = self.config.kind == "tiny_svd"
-        return LatentGeometry(channels=4, spatial=8, temporal=1, multiple=16) if tiny else SVD_GEOMETRY
+        """Pixels and frames per latent cell."""
+        return svd_geometry(self.config)
 
     @property
     def denoiser(self) -> UNetSpatioTemporalConditionModel:
@@ -167,7 +167,8 @@ class SvdBackbone(LazyParts):
 
     def encode_text(self, captions: Sequence[str]) -> list[TextEmbedding]:
         """One unpadded T5 embedding per caption."""
-        return embed_captions(*self.part("text"), captions, length=self.config.text_tokens)
+        tokenizer, encoder = self.part("text")
+        return embed_captions(tokenizer, encoder, captions, length=self.config.text_tokens)
 
     def fingerprint(self) -> dict[str, str]:
         """sha256 of VAE, text encoder and image encoder."""
@@ -264,6 +265,11 @@ def assemble_channels(inputs: StageInputs, noisy_BCFHW: torch.Tensor, *, sigma_B
 
 def _wide(sigma_B: torch.Tensor) -> torch.Tensor:
     return sigma_B.view(-1, 1, 1, 1, 1)
+
+
+def svd_geometry(config: BackboneConfig) -> LatentGeometry:
+    """The tiny network halves its latents once, the real one three times."""
+    return replace(SVD_GEOMETRY, multiple=16) if config.kind == "tiny_svd" else SVD_GEOMETRY
 
 
 def extra_parameters(unet: torch.nn.Module, config: TrainConfig) -> int:

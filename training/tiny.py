@@ -56,7 +56,7 @@ def tiny_transformer(seed: int = 0) -> LTXVideoTransformer3DModel:
 
 def tiny_vae(seed: int = 0, *, timestep_conditioning: bool = False) -> AutoencoderKLLTXVideo:
     """The tiny VAE; ``timestep_conditioning`` as the released 2B model has it."""
-    settings = TINY_VAE | {"timestep_conditioning": timestep_conditioning}
+    settings: dict[str, Any] = TINY_VAE | {"timestep_conditioning": timestep_conditioning}
     return seeded(lambda: AutoencoderKLLTXVideo(**settings), seed=seed)
 
 
@@ -86,13 +86,11 @@ def tiny_unet(seed: int = 0) -> UNetSpatioTemporalConditionModel:
 
 def tiny_image_vae(seed: int = 0) -> AutoencoderKLTemporalDecoder:
     """The tiny SVD VAE with the true ratio of 8 pixels a cell."""
-    blocks = ("DownEncoderBlock2D",) * 4
-    return seeded(
-        lambda: AutoencoderKLTemporalDecoder(
-            down_block_types=blocks, block_out_channels=(32,) * 4, layers_per_block=1, latent_channels=4
-        ),
-        seed=seed,
-    )
+    settings: dict[str, Any] = {
+        "down_block_types": ("DownEncoderBlock2D",) * 4, "block_out_channels": (32,) * 4, "layers_per_block": 1,
+        "latent_channels": 4,
+    }  # fmt: skip
+    return seeded(lambda: AutoencoderKLTemporalDecoder(**settings), seed=seed)
 
 
 def tiny_image_encoder(seed: int = 0) -> torch.nn.Module:

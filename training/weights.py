@@ -94,13 +94,14 @@ def digest_tensors(tensors: Mapping[str, torch.Tensor], *, extra: Any = None) ->
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()
         digest.update(f"{name}:{tensor.dtype}:{tuple(tensor.shape)}".encode())
-        digest.update(tensor.reshape(-1).view(torch.uint8).numpy())
+        data: Any = tensor.reshape(-1).view(torch.uint8).numpy()
+        digest.update(data)
     return digest.hexdigest()
 
 
 def digest_module(module: torch.nn.Module, *, extra: Mapping[str, Any] | None = None) -> str:
     """sha256 of a network's weights and its configuration; where it was loaded from does not count."""
-    config = getattr(module, "config", {})
+    config: Any = getattr(module, "config", {})
     settings = config.to_dict() if hasattr(config, "to_dict") else dict(config)
     settings = {
         key: value
