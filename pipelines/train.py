@@ -13,13 +13,13 @@ from dataset.inspection import find_sample
 from dataset.loader import Sample
 from labeling.camera import Intrinsics, rebased_trajectory
 from labeling.errors import ConfigError
-from labeling.skeleton_video import draw_skeletons
 from pipelines.console import file_size, make_console
 from pipelines.stage import parse_part
 from training.config import STAGES, Stage, load_config
 from training.dry_run import RunPlan
 from training.generation import GeneratedFiles, generate
 from training.latents import CacheSummary, cache_latents
+from training.sampling_inputs import LabelledFrame
 from training.trainer import TrainSummary, train
 
 
@@ -149,9 +149,7 @@ def clip_conditions(sample: Sample, *, with_ego: bool = True) -> dict[str, Any]:
     conditions: dict[str, Any] = {
         "image": next(sample.iterate_frames("rgb.mp4")), "caption": sample.caption, "name": sample.key,
         "intrinsics": intrinsics,
-        "skeleton": draw_skeletons(
-            first, width=768, height=512, label_width=picture["width"], label_height=picture["height"]
-        ),
+        "skeleton": LabelledFrame(labels=first, width=picture["width"], height=picture["height"]),
     }  # fmt: skip
     if with_ego:
         poses = sample.cam_to_world
