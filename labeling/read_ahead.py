@@ -2,8 +2,8 @@
 
 import queue
 import threading
-from collections.abc import Iterator
-from typing import TypeVar
+from collections.abc import Generator, Iterator
+from typing import TypeVar, cast
 
 Item = TypeVar("Item")
 
@@ -11,7 +11,7 @@ _END = object()
 _PATIENCE_S = 0.1
 
 
-def read_ahead(items: Iterator[Item], *, depth: int) -> Iterator[Item]:
+def read_ahead(items: Iterator[Item], *, depth: int) -> Generator[Item, None, None]:
     """The same items in the same order, made by a thread that is at most ``depth`` items ahead.
 
     Pays where both sides spend their time outside the interpreter (decoding here, encoding there). What the thread
@@ -38,16 +38,16 @@ def read_ahead(items: Iterator[Item], *, depth: int) -> Iterator[Item]:
         except BaseException as error:
             failure.append(error)
         finally:
-            close = getattr(items, "close", None)
-            if close is not None:
-                close()
-            put(_END)
+            try:
+                getattr(items, "close", bool)()
+            finally:
+                put(_END)
 
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     try:
         while (item := waiting.get()) is not _END:
-            yield item  # type: ignore[misc]
+            yield cast(Item, item)
         if failure:
             raise failure[0]
     finally:

@@ -6,6 +6,7 @@ Plans are pure; ``cut_run`` and ``copy_clip`` do the work. Spans are half-open i
 import math
 import re
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -276,8 +277,10 @@ def cut_run(
         out_mp4, width=picture.width, height=picture.height, fps=timeline.fps, settings=settings
     ) as writer:
         run = RunEncoder(wanted, writer=writer)
-        for frame in read_ahead(converted_frames(frames, wanted, FrameConverter(output)), depth=_FRAMES_AHEAD):
-            run.show(frame)
+        converted = converted_frames(frames, wanted, FrameConverter(output))
+        with closing(read_ahead(converted, depth=_FRAMES_AHEAD)) as ahead:
+            for frame in ahead:
+                run.show(frame)
         run.finish(source)
     return RunFrames(
         frame=np.arange(span.start, span.end, dtype=np.int32),

@@ -3,7 +3,9 @@
 import math
 from fractions import Fraction
 from pathlib import Path
+from typing import cast
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -23,9 +25,10 @@ from video_fixtures import (
 )
 
 from labeling.camera import cover_map
-from labeling.encoding import EncoderSettings
+from labeling.encoding import EncoderSettings, VideoWriter
 from labeling.errors import ConfigError, StorageError, VideoError
 from labeling.hard_cuts import find_hard_cuts, thumbnail
+from labeling.run_encoder import RunEncoder
 from labeling.timeline import (
     RunFrames,
     Span,
@@ -39,7 +42,7 @@ from labeling.timeline import (
     plan_timeline,
     run_name,
 )
-from labeling.video import probe, read_frames, read_packet_times
+from labeling.video import SourceFrame, probe, read_frames, read_packet_times
 
 SIZE = {"width": 96, "height": 64}
 RATES = [24, 25, 20, 60, 10, Fraction(30000, 1001), Fraction(24000, 1001)]
@@ -88,6 +91,11 @@ def test_variable_rates_agree_with_exact_arithmetic(steps: list[int], first: int
     times = [Fraction(int(tick), 90000) for tick in first + np.concatenate([[0], np.cumsum(steps)])]
     timeline = plan_timeline(as_floats(times))
     assert timeline.source_time_s.tolist() == [float(times[k]) for k in nearest_by_fractions(times, 24)]
+
+
+def test_rounding_never_costs_the_last_frame() -> None:
+    for count in range(1, 300):
+        assert len(plan_timeline(1 / 3 + np.arange(count) / 24)) == count
 
 
 def test_a_tie_goes_to_the_earlier_frame() -> None:
@@ -222,6 +230,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
         SourceSpec(full_range=True),
         SourceSpec(full_range=True, matrix="bt601"),
         SourceSpec(pixel_format="yuv420p10le"),
+        SourceSpec(pixel_format="yuv420p10le", full_range=True),
         SourceSpec(interlaced=True),
         SourceSpec(width=160, height=90),
         SourceSpec(width=90, height=160),
@@ -235,6 +244,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
         "full",
         "full-601",
         "10-bit",
+        "10-bit-full",
         "interlaced",
         "wide",
         "portrait",
@@ -311,6 +321,23 @@ def test_what_does_not_decode_is_a_hole_up_to_the_next_keyframe(
     assert clip_fault(frames, Span(start=0, end=73)) is None
     assert clip_fault(frames, Span(start=120, end=144)) is None
     assert str(clip_fault(frames, Span(start=48, end=121))).startswith(f"hole={len(holes)} frames from ")
+
+
+def test_b_frames_before_a_damaged_frame_are_lost_with_it() -> None:
+    class Sink:
+        def write_frame(self, picture: av.VideoFrame) -> None:
+            assert (picture.width, picture.height) == (96, 64)
+
+    run = RunEncoder(np.arange(7) / 24, writer=cast(VideoWriter, Sink()))
+    for i, (is_bidirectional, is_clean) in enumerate([(0, 1), (1, 1), (0, 1), (1, 1), (1, 1), (0, 0), (0, 1)]):
+        picture = av.VideoFrame.from_ndarray(np.full((96, 96), 20 * i, np.uint8), format="yuv420p")
+        run.show(
+            SourceFrame(
+                time_s=i / 24, picture=picture, is_keyframe=False, is_clean=bool(is_clean),
+                is_bidirectional=bool(is_bidirectional),
+            )
+        )  # fmt: skip
+    assert np.flatnonzero(run.lost).tolist() == [3, 4, 5]
 
 
 def test_a_file_without_its_end_keeps_what_is_there(tmp_path: Path) -> None:

@@ -294,7 +294,7 @@ def test_reading_ahead_keeps_order_passes_errors_and_stops() -> None:
 
     ahead = read_ahead(numbers(), depth=2)
     assert [next(ahead) for _ in range(3)] == [0, 1, 2]
-    ahead.close()  # type: ignore[attr-defined]
+    ahead.close()
     assert len(made) <= 7
 
     def broken():
