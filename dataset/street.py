@@ -302,7 +302,7 @@ def _sky_ring(pieces: int = 24) -> Polygons:
         down = height / ((high - low) * _SKY_M)
         gradients.append(np.array([[*along, k * width / pieces - along @ ring[0]], [0, down, 0, high * _SKY_M * down]]))
     return make_polygons(
-        corners, texture=texture_index("sky"), gradient=np.array(gradients), fog=0.0, grow_px=0.5
+        corners, texture=texture_index("sky"), gradient=np.array(gradients), fog=0.0, soft=0
     )
 
 

@@ -8,7 +8,7 @@ from dataset.street_cars import CarModel, car_model
 from dataset.street_cars import hidden_by_itself as hidden_on_car
 from dataset.street_people import hidden_by_itself as hidden_on_person
 from dataset.street_people import joints_at, person_polygons
-from dataset.street_raster import Polygons
+from dataset.street_raster import ALL_SOFT, Polygons
 from dataset.street_traffic import CarActor, PersonActor
 from labeling.camera import invert, rigid
 from labeling.schemas import Category
@@ -90,7 +90,8 @@ def _car_polygons(
         corners=corners.astype(np.float32), corner_count=model.corner_count[index], colour=lit.astype(np.float32),
         texture=np.full(count, -1, np.int32), gradient=np.zeros((count, 2, 4), np.float32),
         owner=np.zeros(count, np.int32), alpha=np.ones(count, np.float32),
-        grow_px=np.where(model.solid[index], 0.5, 0.3).astype(np.float32), fog=np.ones(count, np.float32),
+        grow_px=np.where(model.solid[index], 0.5, 0.3).astype(np.float32), soft=np.full(count, ALL_SOFT, np.int32),
+        fog=np.ones(count, np.float32),
     )  # fmt: skip
 
 
@@ -126,5 +127,6 @@ def ground_shadows(actors: list[Actor], sun: np.ndarray) -> Polygons:
         colour=np.full((count, 3), 20.0, np.float32), texture=np.full(count, -1, np.int32),
         gradient=np.zeros((count, 2, 4), np.float32), owner=np.zeros(count, np.int32),
         alpha=np.tile(np.array([0.22, 0.34, 0.4], np.float32), len(actors)), grow_px=np.zeros(count, np.float32),
+        soft=np.full(count, ALL_SOFT, np.int32),
         fog=np.zeros(count, np.float32),
     )  # fmt: skip

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from dataset.street_raster import MAX_CORNERS, Polygons
+from dataset.street_raster import ALL_SOFT, MAX_CORNERS, Polygons
 
 _RING = 8
 COCO17_NAMES = (
@@ -193,7 +193,8 @@ def person_polygons(
     return Polygons(
         corners=placed.astype(np.float32), corner_count=number, colour=lit, texture=np.full(total, -1, np.int32),
         gradient=np.zeros((total, 2, 4), np.float32), owner=np.full(total, owner, np.int32),
-        alpha=np.ones(total, np.float32), grow_px=np.full(total, 0.4, np.float32), fog=np.ones(total, np.float32),
+        alpha=np.ones(total, np.float32), grow_px=np.full(total, 0.4, np.float32), soft=np.full(total, ALL_SOFT, np.int32),
+        fog=np.ones(total, np.float32),
     ).take(np.flatnonzero(outward))  # fmt: skip
 
 

@@ -15,9 +15,10 @@ import numpy as np
 MAX_CORNERS = 12
 NO_OWNER = 0
 NO_TEXTURE = -1
+ALL_SOFT = (1 << MAX_CORNERS) - 1
 
 _NEAR_M = 0.12
-_SEGMENT = 8
+_SEGMENT = 12
 # A surface this much farther (relative) than what is painted still wins: decals lie on their host, painted after it.
 _DEPTH_SLACK = 0.985
 _FAST = {"nnan", "ninf", "nsz", "arcp", "contract"}
@@ -43,6 +44,9 @@ class Polygons:
     """(N,) float32: opacity; below 1 neither owner nor depth is written."""
     grow_px: np.ndarray
     """(N,) float32: edges are moved out by this much (0.5 closes the seams of a mesh, 0 is exact)."""
+    soft: np.ndarray
+    """(N,) int32: bit k is set where the edge from corner k blends into what lies behind; other edges are cut at the
+    pixel's centre, as between the pieces of a strip."""
     fog: np.ndarray
     """(N,) float32: share of the haze that applies (0 for the sky)."""
 
@@ -68,6 +72,7 @@ def make_polygons(
     owner: int = NO_OWNER,
     alpha: float = 1.0,
     grow_px: float = 0.0,
+    soft: int = ALL_SOFT,
     fog: float = 1.0,
 ) -> Polygons:
     """Polygons from a list of (n, 3) corner arrays, or from (N, n, 3); every other argument is one value or one per polygon."""
@@ -91,6 +96,7 @@ def make_polygons(
         owner=np.full(count, owner, np.int32),
         alpha=np.full(count, alpha, np.float32),
         grow_px=np.full(count, grow_px, np.float32),
+        soft=np.full(count, soft, np.int32),
         fog=np.full(count, fog, np.float32),
     )
 
@@ -167,11 +173,15 @@ def paint(
         polygons.colour, polygons.texture, polygons.fog, atlas.texels, atlas.offset, atlas.log_width, atlas.log_height,
         atlas.levels, atlas.taps, np.array(haze, np.float32), np.float32(haze_m),
     )  # fmt: skip
-    _paint(
+    count = len(polygons)
+    plan = np.empty((count, 3)), np.zeros((count, 2, 3)), np.empty((count, 2))
+    waiting = np.full(canvas.owner.shape, -1, np.int32)
+    _scan(
         canvas.rgb, canvas.inverse_depth, canvas.owner, drawn, rejected, first, last, polygons.corners,
-        polygons.corner_count, polygons.gradient, shading, polygons.owner, polygons.alpha, polygons.grow_px,
-        world_to_cam.astype(np.float64), np.array(camera, np.float64),
+        polygons.corner_count, polygons.gradient, shading, polygons.owner, polygons.alpha, polygons.grow_px, polygons.soft,
+        world_to_cam.astype(np.float64), np.array(camera, np.float64), waiting, plan,
     )  # fmt: skip
+    _shade_waiting(canvas.rgb, waiting, first, last, plan, shading)
     return drawn, rejected
 
 
@@ -202,57 +212,62 @@ def _texel(texels, start, log_width, mask_u, mask_v, u, v, weight):
     return texels[a + u0] * w00 + texels[a + u1] * w01 + texels[b + u0] * w10 + texels[b + u1] * w11
 
 
-@numba.njit(cache=True)
-def _clip_near(corners, count, rotation, out):
+@numba.njit(cache=True, error_model="numpy")
+def _clip_near(corners, count, soft, rotation, cam, out):
     """Corners into camera axes, cut at the near plane (Sutherland and Hodgman 1974); returns how many are left."""
-    cam = np.empty((count, 3))
+    ahead = 0
     for k in range(count):
         x, y, z = corners[k, 0], corners[k, 1], corners[k, 2]
         for a in range(3):
             cam[k, a] = rotation[a, 0] * x + rotation[a, 1] * y + rotation[a, 2] * z + rotation[a, 3]
+        if cam[k, 2] >= _NEAR_M:
+            ahead += 1
+    if ahead == 0:
+        return 0
     left = 0
     for k in range(count):
-        p, q = cam[k], cam[(k + 1) % count]
-        if p[2] >= _NEAR_M:
-            out[left] = p
-            left += 1
-        if (p[2] >= _NEAR_M) != (q[2] >= _NEAR_M):
-            t = (_NEAR_M - p[2]) / (q[2] - p[2])
+        m = k + 1 if k + 1 < count else 0
+        if cam[k, 2] >= _NEAR_M:
             for a in range(3):
-                out[left, a] = p[a] + t * (q[a] - p[a])
+                out[left, a] = cam[k, a]
+            out[left, 3] = (soft >> k) & 1
+            left += 1
+        if (cam[k, 2] >= _NEAR_M) != (cam[m, 2] >= _NEAR_M):
+            t = (_NEAR_M - cam[k, 2]) / (cam[m, 2] - cam[k, 2])
+            for a in range(3):
+                out[left, a] = cam[k, a] + t * (cam[m, a] - cam[k, a])
+            out[left, 3] = (soft >> k) & 1 if cam[m, 2] >= _NEAR_M else 0
             left += 1
     return left
 
 
-@numba.njit(cache=True)
-def _edges(cam, left, camera, edges, extent):
-    """Inward edge lines (a, b, c) of unit normal in the picture, and the extent; returns False if there is no area."""
-    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
-    screen = np.empty((left, 2))
-    extent[0], extent[1], extent[2], extent[3] = 1e9, 1e9, -1e9, -1e9
+@numba.njit(cache=True, error_model="numpy")
+def _edges(cam, left, camera, screen, edges, extent):
+    """Inward edge lines (a, b, c, soft) of unit normal in the picture, and the extent; returns how many, 0 without area."""
+    x0, y0, x1, y1 = 1e9, 1e9, -1e9, -1e9
     for k in range(left):
-        screen[k, 0] = fx * cam[k, 0] / cam[k, 2] + cx
-        screen[k, 1] = fy * cam[k, 1] / cam[k, 2] + cy
-        extent[0] = min(extent[0], screen[k, 0])
-        extent[1] = min(extent[1], screen[k, 1])
-        extent[2] = max(extent[2], screen[k, 0])
-        extent[3] = max(extent[3], screen[k, 1])
+        x = camera[0] * cam[k, 0] / cam[k, 2] + camera[2]
+        y = camera[1] * cam[k, 1] / cam[k, 2] + camera[3]
+        screen[k, 0], screen[k, 1] = x, y
+        x0, y0, x1, y1 = min(x0, x), min(y0, y), max(x1, x), max(y1, y)
+    extent[0], extent[1], extent[2], extent[3] = x0, y0, x1, y1
     area = 0.0
     for k in range(left):
-        m = (k + 1) % left
+        m = k + 1 if k + 1 < left else 0
         area += screen[k, 0] * screen[m, 1] - screen[m, 0] * screen[k, 1]
     if abs(area) < 1e-6:
         return 0
     sign = 1.0 if area > 0 else -1.0
     used = 0
     for k in range(left):
-        m = (k + 1) % left
+        m = k + 1 if k + 1 < left else 0
         dx, dy = screen[m, 0] - screen[k, 0], screen[m, 1] - screen[k, 1]
         length = np.sqrt(dx * dx + dy * dy)
         if length < 1e-7:
             continue
         edges[used, 0] = -dy / length * sign
         edges[used, 1] = dx / length * sign
+        edges[used, 3] = cam[k, 3]
         edges[used, 2] = -(edges[used, 0] * screen[k, 0] + edges[used, 1] * screen[k, 1])
         used += 1
     return used
@@ -263,13 +278,13 @@ def _inverse_depth_row(cam, left, camera, row):
     """1/z = row[0] x + row[1] y + row[2] over pixels, by Newell's normal; returns False for a plane seen edge on."""
     nx, ny, nz, mx, my, mz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(left):
-        p, q = cam[k], cam[(k + 1) % left]
-        nx += (p[1] - q[1]) * (p[2] + q[2])
-        ny += (p[2] - q[2]) * (p[0] + q[0])
-        nz += (p[0] - q[0]) * (p[1] + q[1])
-        mx += p[0] / left
-        my += p[1] / left
-        mz += p[2] / left
+        m = k + 1 if k + 1 < left else 0
+        nx += (cam[k, 1] - cam[m, 1]) * (cam[k, 2] + cam[m, 2])
+        ny += (cam[k, 2] - cam[m, 2]) * (cam[k, 0] + cam[m, 0])
+        nz += (cam[k, 0] - cam[m, 0]) * (cam[k, 1] + cam[m, 1])
+        mx += cam[k, 0] / left
+        my += cam[k, 1] / left
+        mz += cam[k, 2] / left
     c = nx * mx + ny * my + nz * mz
     if abs(c) < 1e-12:
         return False
@@ -283,40 +298,40 @@ def _inverse_depth_row(cam, left, camera, row):
 def _texture_rows(gradient, rotation, camera, depth_row, rows):
     """Rows so that (u / z, v / z) are affine in the pixel, from gradients in world axes."""
     for t in range(2):
-        g = np.zeros(3)
-        for a in range(3):
-            g[a] = rotation[a, 0] * gradient[t, 0] + rotation[a, 1] * gradient[t, 1] + rotation[a, 2] * gradient[t, 2]
-        offset = gradient[t, 3] - (g[0] * rotation[0, 3] + g[1] * rotation[1, 3] + g[2] * rotation[2, 3])
-        ax, ay = g[0] / camera[0], g[1] / camera[1]
+        x, y, z = gradient[t, 0], gradient[t, 1], gradient[t, 2]
+        gx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+        gy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+        gz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        offset = gradient[t, 3] - (gx * rotation[0, 3] + gy * rotation[1, 3] + gz * rotation[2, 3])
+        ax, ay = gx / camera[0], gy / camera[1]
         rows[t, 0] = ax + offset * depth_row[0]
         rows[t, 1] = ay + offset * depth_row[1]
-        rows[t, 2] = g[2] - ax * camera[2] - ay * camera[3] + offset * depth_row[2]
+        rows[t, 2] = gz - ax * camera[2] - ay * camera[3] + offset * depth_row[2]
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _paint(
+def _scan(
     rgb, inverse_depth, owners, drawn, rejected, first_row, last_row, corners, corner_count, gradient, shading,
-    owner, alpha, grow, rotation, camera,
+    owner, alpha, grow, soft, rotation, camera, waiting, plan,
 ):  # fmt: skip
     """Scan-convert all polygons. Whole pixels are only noted in ``waiting`` and shaded at the end (or when something is
     blended over them), so that what is painted over costs no texture reads."""
     width = inverse_depth.shape[1]
     colour, texture = shading[0], shading[1]
     count = corners.shape[0]
-    depth_rows, rows, spans = np.empty((count, 3)), np.zeros((count, 2, 3)), np.empty((count, 2))
-    waiting = np.full(inverse_depth.shape, -1, np.int32)
-    cam = np.empty((MAX_CORNERS + 2, 3))
-    edges = np.empty((MAX_CORNERS + 2, 3))
+    depth_rows, rows, spans = plan
+    whole, cam, screen = np.empty((MAX_CORNERS, 3)), np.empty((MAX_CORNERS + 2, 4)), np.empty((MAX_CORNERS + 2, 2))
+    edges = np.empty((MAX_CORNERS + 2, 4))
     extent = np.empty(4)
-    plan = (depth_rows, rows, spans)
+    slack = np.float32(_DEPTH_SLACK)
     for n in range(count):
-        left = _clip_near(corners[n], corner_count[n], rotation, cam)
+        left = _clip_near(corners[n], corner_count[n], soft[n], rotation, whole, cam)
         if left < 3:
             continue
-        used = _edges(cam, left, camera, edges, extent)
+        used = _edges(cam, left, camera, screen, edges, extent)
         if used < 3 or not _inverse_depth_row(cam, left, camera, depth_rows[n]):
             continue
-        reach = 0.5 + grow[n]
+        reach, mine = 0.5 + grow[n], np.uint8(owner[n])
         y0 = max(first_row, int(np.ceil(max(extent[1] - reach, -1e6))))
         y1 = min(last_row - 1, int(np.floor(min(extent[3] + reach, 1e6))))
         if y0 > y1 or extent[2] + reach < 0 or extent[0] - reach > width - 1:
@@ -333,49 +348,55 @@ def _paint(
             for k in range(used):
                 a = edges[k, 0]
                 rest = edges[k, 1] * y + edges[k, 2]
+                outer, inner = (-reach, 0.5 - grow[n]) if edges[k, 3] > 0 else (0.0, 0.0)
                 if abs(a) < 1e-9:
-                    if rest < -reach:
+                    if rest < outer:
                         high = low - 1
-                    if rest < 0.5 - grow[n]:
+                    if rest < inner:
                         full_high = full_low - 1
                 elif a > 0:
-                    low = max(low, (-reach - rest) / a)
-                    full_low = max(full_low, (0.5 - grow[n] - rest) / a)
+                    low, full_low = max(low, (outer - rest) / a), max(full_low, (inner - rest) / a)
                 else:
-                    high = min(high, (-reach - rest) / a)
-                    full_high = min(full_high, (0.5 - grow[n] - rest) / a)
+                    high, full_high = min(high, (outer - rest) / a), min(full_high, (inner - rest) / a)
             x0, x1 = int(np.ceil(low)), int(np.floor(high))
             if x0 > x1:
                 continue
             solid0, solid1 = max(x0, int(np.ceil(full_low))), min(x1, int(np.floor(full_high)))
+            whole0, whole1 = solid0, solid1
             if solid1 < solid0 or alpha[n] < np.float32(0.999):
                 solid0, solid1 = x1 + 1, x1
+            # Locals: what is stored below could alias the arrays, so the compiler would read them again at each pixel.
+            depth_x, depth0 = depth_rows[n, 0], depth_rows[n, 1] * y + depth_rows[n, 2]
+            least, most = spans[n, 0], spans[n, 1]
+            depth_line, waiting_line, owner_line = inverse_depth[y], waiting[y], owners[y]
+            new, lost = 0, 0
             for x in range(solid0, solid1 + 1):
-                inv = np.float32(min(max(depth_rows[n, 0] * x + depth_rows[n, 1] * y + depth_rows[n, 2], spans[n, 0]), spans[n, 1]))
-                if inv < inverse_depth[y, x] * _DEPTH_SLACK:
-                    if owners[y, x] != owner[n]:
-                        rejected[owner[n]] += 1
-                    continue
-                waiting[y, x] = n
-                inverse_depth[y, x] = inv
-                if owners[y, x] != owner[n]:
-                    owners[y, x] = np.uint8(owner[n])
-                    drawn[owner[n]] += 1
+                inv = np.float32(min(max(depth_x * x + depth0, least), most))
+                if inv < depth_line[x] * slack:
+                    lost += owner_line[x] != mine
+                else:
+                    waiting_line[x] = n
+                    depth_line[x] = inv
+                    new += owner_line[x] != mine
+                    owner_line[x] = mine
+            drawn[mine] += new
+            rejected[mine] += lost
             for piece in range(2):
                 start, stop = (x0, min(solid0, x1 + 1)) if piece == 0 else (solid1 + 1, x1 + 1)
                 if piece == 1 and solid1 < solid0:
                     continue
                 for x in range(start, stop):
                     distance = 1e9
-                    for k in range(used):
-                        distance = min(distance, edges[k, 0] * x + edges[k, 1] * y + edges[k, 2])
+                    if x < whole0 or x > whole1:
+                        for k in range(used):
+                            if edges[k, 3] > 0:
+                                distance = min(distance, edges[k, 0] * x + edges[k, 1] * y + edges[k, 2])
                     cover = min(np.float32(1.0), np.float32(distance + reach)) * alpha[n]
                     if cover <= 0:
                         continue
-                    inv = np.float32(min(max(depth_rows[n, 0] * x + depth_rows[n, 1] * y + depth_rows[n, 2], spans[n, 0]), spans[n, 1]))
-                    if inv < inverse_depth[y, x] * _DEPTH_SLACK:
-                        if owners[y, x] != owner[n]:
-                            rejected[owner[n]] += 1
+                    inv = np.float32(min(max(depth_x * x + depth0, least), most))
+                    if inv < depth_line[x] * slack:
+                        rejected[mine] += owner_line[x] != mine
                         continue
                     under = waiting[y, x]
                     waiting[y, x] = -1
@@ -383,16 +404,22 @@ def _paint(
                         who, opacity = (under, np.float32(1.0)) if layer == 0 else (n, cover)
                         _shade(rgb, who, y, x, x + 1, plan, shading, opacity)
                     if alpha[n] >= np.float32(0.999) and cover >= np.float32(0.5):
-                        inverse_depth[y, x] = inv
-                        if owners[y, x] != owner[n]:
-                            owners[y, x] = np.uint8(owner[n])
-                            drawn[owner[n]] += 1
+                        depth_line[x] = inv
+                        drawn[mine] += owner_line[x] != mine
+                        owner_line[x] = mine
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _shade_waiting(rgb, waiting, first_row, last_row, plan, shading):
+    """Shade all pixels that wait, in runs of one polygon."""
+    width = waiting.shape[1]
     for y in range(first_row, last_row):
+        line = waiting[y]
         x = 0
         while x < width:
-            n = waiting[y, x]
+            n = line[x]
             stop = x + 1
-            while stop < width and waiting[y, stop] == n and stop - x < _SEGMENT:
+            while stop < width and line[stop] == n and stop - x < _SEGMENT:
                 stop += 1
             if n >= 0:
                 _shade(rgb, n, y, x, stop, plan, shading, np.float32(1.0))
@@ -443,6 +470,8 @@ def _shade(rgb, n, y, x0, x1, plan, shading, cover):
         else:
             du, dv = np.float32(uy / taps), np.float32(vy / taps)
     red, green, blue, fog = colours[n, 0], colours[n, 1], colours[n, 2], fogs[n]
+    haze_r, haze_g, haze_b = haze[0], haze[1], haze[2]
+    top, line = np.float32(255.0), rgb[y]
     for x in range(x0, x1):
         inv = min(max(depth_x * x + depth0, farthest), nearest)
         r, g, b = red, green, blue
@@ -463,13 +492,13 @@ def _shade(rgb, n, y, x0, x1, plan, shading, cover):
             g *= np.float32((packed >> 21) & 0x1FFFFF) * scale
             b *= np.float32(packed >> 42) * scale
         haziness = fog / (one + np.float32(inv) * haze_m)
-        r += (haze[0] - r) * haziness
-        g += (haze[1] - g) * haziness
-        b += (haze[2] - b) * haziness
+        r += (haze_r - r) * haziness
+        g += (haze_g - g) * haziness
+        b += (haze_b - b) * haziness
         if cover < one:
-            r = rgb[y, x, 0] + (r - rgb[y, x, 0]) * cover
-            g = rgb[y, x, 1] + (g - rgb[y, x, 1]) * cover
-            b = rgb[y, x, 2] + (b - rgb[y, x, 2]) * cover
-        rgb[y, x, 0] = np.uint8(min(np.float32(255.0), r + np.float32(0.5)))
-        rgb[y, x, 1] = np.uint8(min(np.float32(255.0), g + np.float32(0.5)))
-        rgb[y, x, 2] = np.uint8(min(np.float32(255.0), b + np.float32(0.5)))
+            r = line[x, 0] + (r - line[x, 0]) * cover
+            g = line[x, 1] + (g - line[x, 1]) * cover
+            b = line[x, 2] + (b - line[x, 2]) * cover
+        line[x, 0] = np.uint8(np.int32(min(top, r + half)))
+        line[x, 1] = np.uint8(np.int32(min(top, g + half)))
+        line[x, 2] = np.uint8(np.int32(min(top, b + half)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dataset.street_drives import StreetPath
-from dataset.street_raster import NO_TEXTURE, Polygons, join, make_polygons
+from dataset.street_raster import ALL_SOFT, NO_TEXTURE, Polygons, join, make_polygons
 from dataset.street_textures import FACADES, GROUND_FLOORS, TEXTURE_METRES, TextureName, texture_index, texture_size
 
 LANE_WIDTH_M = 3.5
@@ -16,6 +16,7 @@ _MARK_HALF_M = 0.075
 _DASH_M, _GAP_M = 3.0, 6.0
 _WHITE, _YELLOW = (226.0, 226.0, 222.0), (220.0, 182.0, 74.0)
 _BASE_DROP_M = 0.3
+_SIDES = 0b0101
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,7 +138,7 @@ def _base_ground(path: StreetPath) -> Polygons:
     if np.ptp(path.elevation) < 1e-6:
         reach = 4000.0
         square = np.array([(-reach, 0, -reach), (reach, 0, -reach), (reach, 0, reach), (-reach, 0, reach)])
-        return make_polygons([square], texture=texture_index("grass"), gradient=gradient)
+        return make_polygons([square], texture=texture_index("grass"), gradient=gradient, soft=0)
     step = 24.0
     low = path.points_xz.min(axis=0) - 360
     nodes = [np.arange(low[axis], path.points_xz[:, axis].max() + 360, step) for axis in (0, 1)]
@@ -154,7 +155,7 @@ def _base_ground(path: StreetPath) -> Polygons:
             ring = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)]
             corners = np.array([(grid[a][0], -height[a], grid[a][1]) for a in ring])
             patches += [corners[[0, 1, 2]], corners[[0, 2, 3]]]
-    return make_polygons(patches, texture=texture_index("grass"), gradient=gradient)
+    return make_polygons(patches, texture=texture_index("grass"), gradient=gradient, soft=0)
 
 
 def _stations(path: StreetPath, start: float, end: float, *, longest: float = 8.0) -> np.ndarray:
@@ -190,7 +191,7 @@ def _ribbons(path: StreetPath, plan: StreetPlan) -> list[Polygons]:
     return [
         make_polygons(
             _ribbon(path, arcs, left, right), colour=(shade, shade, shade), texture=texture_index(name),
-            gradient=ground_gradient(name), grow_px=0.4,
+            gradient=ground_gradient(name), soft=_SIDES,
         )
         for name, shade, left, right in strips
     ]  # fmt: skip
@@ -206,7 +207,8 @@ def _markings(path: StreetPath, plan: StreetPlan) -> list[Polygons]:
                 quads += _ribbon(path, _stations(path, start, start + _DASH_M, longest=1.5), *edges)
         else:
             quads = _ribbon(path, _stations(path, path.start_m + 1, path.end_m - 1, longest=4.0), *edges)
-        parts.append(make_polygons(quads, colour=_YELLOW if line.yellow else _WHITE, grow_px=0.3))
+        colour = _YELLOW if line.yellow else _WHITE
+        parts.append(make_polygons(quads, colour=colour, grow_px=0.3 if line.dashed else 0.0, soft=ALL_SOFT if line.dashed else _SIDES))
     return parts
 
 
