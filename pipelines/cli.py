@@ -101,6 +101,19 @@ def slice_videos(
     raise typer.Exit(run_slice(videos, out, options))
 
 
+@app.command(rich_help_panel=LABEL)
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for videos, job, adapters and report.")] = Path(
+        "demo"
+    ),
+    workers: Workers = None,
+) -> None:
+    """The whole of it on a synthetic street, in minutes: videos, labels, two adapters, a sample, a report."""
+    from pipelines.demo import run_demo
+
+    raise typer.Exit(run_demo(out, workers=workers))
+
+
 def _stage_command(name: str, text: str) -> None:
     def command(out: Out, workers: Workers = None, part: PartOf = None) -> None:
         from pipelines.commands import run_single

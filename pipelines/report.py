@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from dataset.inspection import SHEET_ROWS, Summary, contact_sheet, find_sample, summarize
 from dataset.loader import Sample, ShardDataset
-from dataset.receipts import atomic_write, read_receipts
+from dataset.receipts import atomic_write
 from dataset.selection import Selection, read_selection
 from labeling.encoding import EncoderSettings, VideoWriter
 from labeling.errors import DataError
@@ -160,9 +160,9 @@ def _some_clips(root: Path, most: int = 1) -> list[Sample]:
 
 
 def _stage_table(root: Path, status: JobStatus) -> PageTable:
-    rows = []
+    rows, job = [], open_job(root)
     for stage in status.stages:
-        receipts = read_receipts(root, stage.stage).values()
+        receipts = job.settled(stage.stage).values() if stage.items is not None else ()
         frames = sum(receipt.facts.get("frames", 0) for receipt in receipts if receipt.state == "done")
         seconds = sum(receipt.seconds for receipt in receipts)
         lost = [f"{count} {reason}" for reason, count in {**stage.dropped, **stage.failed, **stage.retryable}.items()]

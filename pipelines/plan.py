@@ -1,0 +1,246 @@
+"""What a job would take, before anything is spent: clips, disk and hours, from a minute of the footage itself.
+
+Lengths come from the videos' headers. Costs come from a small job on windows of the same videos, with the same settings, run
+twice in a scratch folder: the first time to load and compile, the second to be measured.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dataset.receipts import Receipt, hashed_share, read_receipts
+from labeling.errors import ConfigError, VideoError
+from labeling.timeline import ClipSettings
+from labeling.video import probe
+from pipelines.commands import JobOptions, configured
+from pipelines.config import Config
+from pipelines.engine import Engine
+from pipelines.job import Job, Source, find_videos
+from pipelines.label import ALL_STAGES, Reporter, StageReport, run_stages
+from pipelines.stage import Part
+
+CALIBRATION_S = 60.0
+_WINDOWS = 3
+_WARM_UP_CLIPS = 1
+_FPS = 24
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageCost:
+    """One stage of the whole job."""
+
+    stage: str
+    core_hours: float
+    disk_bytes: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobPlan:
+    """What the job would take."""
+
+    videos: int
+    broken: tuple[str, ...]
+    """Videos that cannot be opened, with the reason."""
+    source_hours: float
+    clips: int
+    """Candidates: all that fit on the videos' timelines, before holes are known."""
+    kept_clips: int
+    """Kept by their objects."""
+    sampled_clips: int
+    """Taken of the kept ones."""
+    clip_hours: float
+    """Of the sampled clips, overlaps counted as often as they occur."""
+    stages: tuple[StageCost, ...]
+    calibration_s: float
+    """Seconds of footage that costs were measured on."""
+    workers: int
+    parts: int
+    largest_part: float
+    """Share of the footage that falls to the busiest host."""
+
+    @property
+    def core_hours(self) -> float:
+        """Over all stages and hosts."""
+        return sum(stage.core_hours for stage in self.stages)
+
+    @property
+    def disk_bytes(self) -> int:
+        """All that is left in the job's folder."""
+        return sum(stage.disk_bytes for stage in self.stages)
+
+    @property
+    def hours_per_host(self) -> float:
+        """Until the busiest host is done."""
+        return self.core_hours * self.largest_part / self.workers
+
+
+def plan_job(
+    videos: Sequence[Path], options: JobOptions, *, workers: int, parts: int = 1, calibration_s: float = CALIBRATION_S
+) -> JobPlan:
+    """The plan of ``animatic label`` with the same videos and options.
+
+    Raises:
+        ConfigError: settings or videos that cannot be used, or no video long enough for a clip.
+    """
+    config = configured(Config(), options)
+    sources = find_videos(videos, leave_out=options.leave_out)
+    lengths, broken = _lengths_s(sources)
+    candidates = {name: count_candidates(length, config.clip) for name, length in lengths.items()}
+    total = sum(candidates.values())
+    if total == 0:
+        raise ConfigError(f"none of {len(sources)} videos is long enough for one clip of {_clip_s(config.clip):g} s")
+    usable = [source for source in sources if candidates.get(source.video_id)]
+    windows = plan_windows(usable, lengths, clip=config.clip, seconds=calibration_s)
+    receipts = _calibrate(windows, config, options.models)
+    measured = _Measured.of(receipts)
+    kept = max(1, round(total * measured.kept_clips / measured.clips))
+    sampled = min(kept, config.select.sample_clips or kept)
+    return JobPlan(
+        videos=len(lengths), broken=broken, source_hours=sum(lengths.values()) / 3600, clips=total, kept_clips=kept,
+        sampled_clips=sampled, clip_hours=sampled * _clip_s(config.clip) / 3600,
+        stages=_scaled(receipts, measured, lengths, clips=total, sampled=sampled),
+        calibration_s=measured.window_s, workers=workers, parts=parts,
+        largest_part=_largest_part(lengths, parts),
+    )  # fmt: skip
+
+
+def count_candidates(length_s: float, clip: ClipSettings) -> int:
+    """Clips that fit on a timeline of that length."""
+    frames = int(length_s * _FPS) + 1
+    return 0 if frames < clip.clip_frames else (frames - clip.clip_frames) // clip.stride_frames + 1
+
+
+def plan_windows(
+    sources: Sequence[Source], lengths_s: dict[str, float], *, clip: ClipSettings, seconds: float
+) -> list[Source]:
+    """Some of the videos with all but a window in their middle left out, ``seconds`` together.
+
+    Videos are drawn by the hash of their id; each gives an equal share, short ones all they have.
+    """
+    drawn = sorted(sources, key=lambda source: hashed_share("plan", source.video_id))
+    least = _clip_s(clip) + 1 / _FPS
+    windows: list[Source] = []
+    left = seconds
+    for position, source in enumerate(drawn):
+        if left <= 0:
+            break
+        share = left / max(1, min(_WINDOWS, len(drawn)) - position)
+        start, end = source.leave_out_s
+        usable = lengths_s[source.video_id]
+        window = min(usable, max(least, share))
+        margin = (usable - window) / 2
+        windows.append(replace(source, leave_out_s=(start + margin, end + margin)))
+        left -= window
+    return windows
+
+
+def _lengths_s(sources: Sequence[Source]) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Usable seconds by video, and the videos that cannot be opened."""
+    lengths: dict[str, float] = {}
+    broken = []
+    for source in sources:
+        try:
+            lengths[source.video_id] = max(0.0, probe(source.path).duration_s - sum(source.leave_out_s))
+        except VideoError as error:
+            broken.append(str(error))
+    if not lengths:
+        raise ConfigError(f"none of {len(sources)} videos can be opened: {broken[0]}")
+    return lengths, tuple(broken)
+
+
+class _Quiet(Reporter):
+    """Shows nothing."""
+
+    def stage_started(self, stage: str, *, items: int, weight: float, current: int) -> None:
+        """Nothing."""
+
+    def item_finished(self, receipt: Receipt, *, weight: float) -> None:
+        """Nothing."""
+
+    def stage_finished(self, report: StageReport) -> None:
+        """Nothing."""
+
+    def waiting(self, message: str) -> None:
+        """Nothing."""
+
+
+def _calibrate(windows: Sequence[Source], config: Config, models_dir: Path | None) -> dict[str, dict[str, Receipt]]:
+    """Receipts of a small job on the windows; a still smaller one before it pays for loading and compiling."""
+    unsampled = config.model_copy(update={"select": config.select.model_copy(update={"sample_clips": None})})
+    first = windows[0]
+    clip_s = _clip_s(config.clip) * _WARM_UP_CLIPS
+    start, end = first.leave_out_s
+    spare = max(0.0, probe(first.path).duration_s - start - end - clip_s - 0.5)
+    warm_up = replace(first, leave_out_s=(start, end + spare))
+    with tempfile.TemporaryDirectory(prefix="animatic-plan-") as scratch:
+        _run(Path(scratch) / "warm-up", [warm_up], unsampled, models_dir)
+        return _run(Path(scratch) / "job", windows, unsampled, models_dir)
+
+
+def _run(
+    root: Path, sources: Sequence[Source], config: Config, models_dir: Path | None
+) -> dict[str, dict[str, Receipt]]:
+    root.mkdir()
+    # The split has no cost, and a split file names videos that the windows leave out.
+    config = config.model_copy(update={"select": config.select.model_copy(update={"split": None})})
+    job = Job(root, config, {source.video_id: source for source in sources}, models_dir=models_dir)
+    job.save()
+    with Engine(root, workers=0) as engine:
+        run_stages(job, ALL_STAGES, engine, _Quiet())
+    return {stage: read_receipts(root, stage) for stage in ALL_STAGES}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Measured:
+    """What the calibration job saw."""
+
+    window_s: float
+    video_s: float
+    clips: int
+    kept_clips: int
+
+    @classmethod
+    def of(cls, receipts: dict[str, dict[str, Receipt]]) -> "_Measured":
+        failed = [receipt for stage in receipts.values() for receipt in stage.values() if receipt.state == "failed"]
+        if failed:
+            raise ConfigError(f"a trial on the footage failed in {failed[0].stage}: {failed[0].message}")
+        (chosen,) = receipts["select"].values()
+        clips = max(1, int(chosen.facts["clips"]))
+        return cls(
+            window_s=sum(float(receipt.facts["frames"]) for receipt in receipts["cut"].values()) / _FPS,
+            video_s=sum(float(receipt.facts["seconds"]) for receipt in receipts["index"].values()),
+            clips=clips, kept_clips=max(1, int(chosen.facts["kept"])),
+        )  # fmt: skip
+
+
+def _scaled(
+    receipts: dict[str, dict[str, Receipt]],
+    measured: _Measured,
+    lengths_s: dict[str, float],
+    *,
+    clips: int,
+    sampled: int,
+) -> tuple[StageCost, ...]:
+    """Costs of the whole job: reading grows with the footage, counting with its clips, the rest with what is taken."""
+    by_length = sum(lengths_s.values()) / max(measured.video_s, 1e-9)
+    factors = {"source": by_length, "index": by_length, "count": clips / measured.clips, "select": 1.0}
+    costs = []
+    for stage, made in receipts.items():
+        factor = factors.get(stage, sampled / measured.kept_clips)
+        seconds = sum(receipt.seconds for receipt in made.values())
+        size = sum(output.size for receipt in made.values() for output in receipt.outputs)
+        costs.append(StageCost(stage=stage, core_hours=seconds * factor / 3600, disk_bytes=round(size * factor)))
+    return tuple(costs)
+
+
+def _largest_part(lengths_s: dict[str, float], parts: int) -> float:
+    shares = [
+        sum(length for name, length in lengths_s.items() if Part(index=index, count=parts).owns(name))
+        for index in range(1, parts + 1)
+    ]
+    return max(shares) / max(sum(lengths_s.values()), 1e-9)
+
+
+def _clip_s(clip: ClipSettings) -> float:
+    return clip.clip_frames / _FPS
