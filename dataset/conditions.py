@@ -23,7 +23,8 @@ CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 
 DEFAULT_AMOUNT: dict[Condition, float] = {
     "clean": 0.0, "dusk": 0.4, "night": 0.15, "rain": 1.0, "glare": 1.0, "wiper": 1.0, "motion_blur": 15.0,
-    "noise": 4.0, "bonnet": 0.15, "overlay": 0.15, "letterbox": 0.12, "brightness_ramp": 0.5, "h264": 40.0, "black": 0.0,
+    "noise": 4.0, "bonnet": 0.15, "overlay": 0.15, "letterbox": 0.12, "brightness_ramp": 0.5, "h264": 40.0,
+    "black": 0.0,
 }  # fmt: skip
 """What ``amount`` means: a gain (dusk, night), a strength from 0 to 1 (rain, glare, wiper), pixels (motion_blur), grey
 levels of sigma (noise), a share of the picture's height or area (bonnet, overlay, letterbox), a relative change
@@ -199,7 +200,7 @@ def _overlay(rgb: np.ndarray, amount: float, seed: int, frame: int, rng: np.rand
     """A recorder's bar along the lower edge, ``amount`` of the height, with a running clock."""
     height, width = rgb.shape[:2]
     out = rgb.copy()
-    top = int(round(height * (1 - amount)))
+    top = round(height * (1 - amount))
     out[top:] = (12, 14, 16)
     text = f"CAM {seed % 100:02d}  {frame // (60 * _FPS):02d}:{frame // _FPS % 60:02d}.{frame % _FPS:02d}  000 km/h"
     scale = max(0.3, (height - top) / 60)
@@ -210,7 +211,7 @@ def _overlay(rgb: np.ndarray, amount: float, seed: int, frame: int, rng: np.rand
 
 def _letterbox(rgb: np.ndarray, amount: float, seed: int, frame: int, rng: np.random.Generator) -> np.ndarray:
     out = rgb.copy()
-    bar = int(round(rgb.shape[0] * amount))
+    bar = round(rgb.shape[0] * amount)
     out[:bar] = 0
     out[rgb.shape[0] - bar :] = 0
     return out
@@ -226,7 +227,7 @@ def _h264(rgb: np.ndarray, amount: float, seed: int, frame: int, rng: np.random.
     """One picture coded alone; ``compress_frames`` codes a whole stream."""
     height, width = rgb.shape[:2]
     even = cv2.copyMakeBorder(rgb, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-    return next(compress_frames([even], crf=int(round(amount))))[:height, :width].copy()
+    return next(compress_frames([even], crf=round(amount)))[:height, :width].copy()
 
 
 _MAKERS: dict[Condition, Callable[[np.ndarray, float, int, int, np.random.Generator], np.ndarray]] = {

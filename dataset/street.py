@@ -7,7 +7,7 @@ The embedded default data of the project, and the exact-truth world for its test
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -15,10 +15,11 @@ from dataset.conditions import Condition, apply_condition
 from dataset.street_actors import Actor, car_actor_now, ground_shadows, person_actor_now
 from dataset.street_drives import Drive, StreetPath, drive_along, drive_given, path_from_bends, speed_profile, wandering
 from dataset.street_labels import StreetObject, label_actors, label_lanes
-from dataset.street_raster import Canvas, Polygons, blank_canvas, join, make_polygons, paint
+from dataset.street_polygons import Canvas, Polygons, blank_canvas, join, make_polygons
+from dataset.street_raster import paint
 from dataset.street_scene import StillWorld, build_world, facing, plan_street
 from dataset.street_textures import HAZE, SKY_TANGENTS, SKY_TOP, street_atlas, texture_index, texture_size
-from dataset.street_traffic import Density, cast_street
+from dataset.street_traffic import CarActor, Density, PersonActor, cast_street
 from labeling.camera import Intrinsics, Trajectory, invert, rebased_trajectory
 from labeling.errors import ConfigError
 from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
@@ -34,6 +35,9 @@ _HAZE_M = 420.0
 _FAR_M = 260.0
 _SHADOW_M = 90.0
 _ACTORS_M = 130.0
+_MOST_ACTORS = 250
+
+_Way = TypeVar("_Way", CarActor, PersonActor)
 _SKY_M = 2.0e4
 
 
@@ -170,17 +174,20 @@ class Street:
     def _actors(self, i: int, cam_to_street: np.ndarray) -> list[Actor]:
         """Who is near and not wholly behind, from far to near."""
         eye = cam_to_street[:3, 3]
-        found: list[tuple[float, Actor]] = []
-        for actors, make, radius in ((self._cars, car_actor_now, 3.0), (self._people, person_actor_now, 1.5)):
-            if not actors:
-                continue
-            middle = np.array([actor.position[i] for actor in actors]) - (0.0, 0.9, 0.0)
-            seen = self._in_view(middle, np.full(len(middle), radius), cam_to_street)  # False for NaN: not there now.
-            for index in np.flatnonzero(seen & (np.linalg.norm(middle - eye, axis=1) < _ACTORS_M)):
-                actor = make(actors[index], i, eye=eye, sun=self._sun)
-                found.append((actor.distance_m, actor))
-        found.sort(key=lambda pair: -pair[0])
-        return [actor.with_owner(order + 1) for order, (_, actor) in enumerate(found[-250:])]
+        found = [car_actor_now(car, i, eye=eye, sun=self._sun) for car in self._near(self._cars, i, 3.0)]
+        found += [person_actor_now(person, i, eye=eye, sun=self._sun) for person in self._near(self._people, i, 1.5)]
+        found.sort(key=lambda actor: -actor.distance_m)
+        return [actor.with_owner(order + 1) for order, actor in enumerate(found[-_MOST_ACTORS:])]
+
+    def _near(self, actors: list[_Way], i: int, radius: float) -> list[_Way]:
+        """Those that may reach into the picture; a place of NaN (not there now) never does."""
+        if not actors:
+            return []
+        cam_to_street = self._pose(i)
+        middle = np.array([actor.position[i] for actor in actors]) - (0.0, 0.9, 0.0)
+        seen = self._in_view(middle, np.full(len(middle), radius), cam_to_street)
+        seen &= np.linalg.norm(middle - cam_to_street[:3, 3], axis=1) < _ACTORS_M
+        return [actors[index] for index in np.flatnonzero(seen)]
 
     def _paint(self, cam_to_street: np.ndarray, actors: list[Actor]) -> tuple[Canvas, np.ndarray, np.ndarray]:
         polygons = self._visible(cam_to_street, actors)
@@ -301,9 +308,7 @@ def _sky_ring(pieces: int = 24) -> Polygons:
         along = chord / (chord @ chord) * width / pieces
         down = height / ((high - low) * _SKY_M)
         gradients.append(np.array([[*along, k * width / pieces - along @ ring[0]], [0, down, 0, high * _SKY_M * down]]))
-    return make_polygons(
-        corners, texture=texture_index("sky"), gradient=np.array(gradients), fog=0.0, soft=0
-    )
+    return make_polygons(corners, texture=texture_index("sky"), gradient=np.array(gradients), fog=0.0, soft=0)
 
 
 def _record(frame: int, thing: StreetObject) -> Keypoints:

@@ -8,7 +8,7 @@ from dataset.street_cars import CarModel, car_model
 from dataset.street_cars import hidden_by_itself as hidden_on_car
 from dataset.street_people import hidden_by_itself as hidden_on_person
 from dataset.street_people import joints_at, person_polygons
-from dataset.street_raster import ALL_SOFT, Polygons
+from dataset.street_polygons import ALL_SOFT, Polygons
 from dataset.street_traffic import CarActor, PersonActor
 from labeling.camera import invert, rigid
 from labeling.schemas import Category

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from dataset.street_raster import MAX_CORNERS
+from dataset.street_polygons import MAX_CORNERS
 from labeling.schemas import keypoint_schema
 
 CarShape = Literal["sedan", "hatch", "suv", "van", "coupe"]
@@ -167,12 +167,14 @@ def _body(size: CarSize) -> np.ndarray:
     return _both([
         (front - 0.10, half * 0.70, low + 0.02), (front - 0.02, half * 0.66, 0.36), (front, half * 0.64, 0.50),
         (front - 0.06, half * 0.66, hood - 0.10), (front - 0.18, half * 0.64, hood),
-        (front - 0.24, half * 0.90, low + 0.02), (front - 0.20, half * 0.90, 0.48), (front - 0.26, half * 0.88, hood - 0.1),
+        (front - 0.24, half * 0.90, low + 0.02), (front - 0.20, half * 0.90, 0.48),
+        (front - 0.26, half * 0.88, hood - 0.1),
         (front - 0.44, half * 0.80, hood + 0.02),
         (front - 0.62, half, low + 0.06), (front - 0.62, half, hood - 0.16),
         (size.screen_base, half * 0.9, belt), (size.screen_base - 0.1, half, belt - 0.13),
         (rear + 0.55, half, low + 0.06), (rear + 0.55, half, belt - 0.13), (rear + 0.40, half * 0.92, belt),
-        (rear + 0.16, half * 0.88, low + 0.04), (rear + 0.12, half * 0.90, 0.52), (rear + 0.16, half * 0.88, belt - 0.06),
+        (rear + 0.16, half * 0.88, low + 0.04), (rear + 0.12, half * 0.90, 0.52),
+        (rear + 0.16, half * 0.88, belt - 0.06),
         (rear + 0.05, half * 0.70, low + 0.06), (rear, half * 0.68, 0.52), (rear + 0.05, half * 0.68, belt - 0.08),
         (rear + 0.14, half * 0.72, belt),
     ])  # fmt: skip
@@ -196,23 +198,26 @@ def _windows(make: _Builder, size: CarSize) -> None:
                             ("front_high", size.roof_front), ("rear_high", size.roof_rear))
     }  # fmt: skip
 
-    def pane(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, box: tuple[float, float, float, float]):
+    def pane(quad: list[np.ndarray], box: tuple[float, float, float, float]) -> np.ndarray:
         """Part of the quad a-b (below) to d-c (above), by shares."""
+        a, b, c, d = quad
+
         def spot(u: float, v: float) -> np.ndarray:
             return (a + (b - a) * u) * (1 - v) + (d + (c - d) * u) * v
+
         left, bottom, right, top = box
         return np.array([spot(left, bottom), spot(right, bottom), spot(right, top), spot(left, top)])
 
     for low_name, high_name, towards in (("front_low", "front_high", 1.0), ("rear_low", "rear_high", -1.0)):
         quad = [corners[low_name, 1], corners[low_name, -1], corners[high_name, -1], corners[high_name, 1]]
-        make.detail(pane(*quad, (0.05, 0.06, 0.95, 0.92)), (towards, 0, 0), 2, _GLASS, gloss=0.8)
+        make.detail(pane(quad, (0.05, 0.06, 0.95, 0.92)), (towards, 0, 0), 2, _GLASS, gloss=0.8)
         sheen = tuple(c + 26 for c in _GLASS)
-        make.detail(pane(*quad, (0.10, 0.58, 0.62, 0.88)), (towards, 0, 0), 2, sheen, gloss=0.8)
+        make.detail(pane(quad, (0.10, 0.58, 0.62, 0.88)), (towards, 0, 0), 2, sheen, gloss=0.8)
     pillar = 0.52 if size.length < 4.8 else 0.66
     for side in (1, -1):
         quad = [corners[n, side] for n in ("rear_low", "front_low", "front_high", "rear_high")]
         for left, right in ((0.05, pillar - 0.02), (pillar + 0.02, 0.94)):
-            make.detail(pane(*quad, (left, 0.08, right, 0.88)), (0, side, 0), 2, _GLASS, gloss=0.7)
+            make.detail(pane(quad, (left, 0.08, right, 0.88)), (0, side, 0), 2, _GLASS, gloss=0.7)
 
 
 def _ends(make: _Builder, size: CarSize, body: np.ndarray) -> dict[str, np.ndarray]:
@@ -220,7 +225,9 @@ def _ends(make: _Builder, size: CarSize, body: np.ndarray) -> dict[str, np.ndarr
     half = size.width / 2
     named: dict[str, np.ndarray] = {}
 
-    def patch(sign: float, y: tuple[float, float], z: tuple[float, float], colour: tuple | None, **options) -> np.ndarray:
+    def patch(
+        sign: float, y: tuple[float, float], z: tuple[float, float], colour: tuple | None, **options
+    ) -> np.ndarray:
         flat = np.array([(0, y[0], z[0]), (0, y[1], z[0]), (0, y[1], z[1]), (0, y[0], z[1])])
         corners = _surface(body, 0, sign, flat) + (sign * 0.012, 0, 0)
         triangles = [corners[[0, 1, 2]], corners[[0, 2, 3]]]
@@ -285,7 +292,9 @@ def _sides(make: _Builder, size: CarSize) -> dict[str, np.ndarray]:
             for spoke in range(5):
                 a = spoke * 2 * np.pi / 5 + 0.3
                 ring = np.array([(np.cos(t), np.sin(t)) for t in (a - 0.3, a + 0.3)]) * radius * 0.56
-                tip = np.array([(x + np.cos(a) * radius * 0.16, side * (half + 0.02), radius + np.sin(a) * radius * 0.16)])
+                tip = np.array(
+                    [(x + np.cos(a) * radius * 0.16, side * (half + 0.02), radius + np.sin(a) * radius * 0.16)]
+                )
                 fan = np.array([(x + px, side * (half + 0.02), radius + pz) for px, pz in ring])
                 make.detail(np.concatenate([tip, fan]), out, 1, (70, 72, 76))
             make.detail(_disc(x, side * (half + 0.024), radius * 0.13, radius), out, 1, (200, 202, 206))
@@ -306,8 +315,9 @@ def _mirrors(make: _Builder, size: CarSize) -> dict[str, np.ndarray]:
         box = [(x + dx, y, z) for y, dz in ((inner, 0.03), (outer, 0.0)) for dx in (-0.05, 0.07)
                for z in (low + dz, low + 0.15 - dz / 2)]  # fmt: skip
         make.solids.append(make.hull(np.array(box), part, gloss=0.3))
-        glass = np.array([(x - 0.052, inner + side * 0.03, low + 0.04), (x - 0.052, outer - side * 0.02, low + 0.02),
-                          (x - 0.052, outer - side * 0.02, low + 0.13), (x - 0.052, inner + side * 0.03, low + 0.12)])  # fmt: skip
+        back, near, far = x - 0.052, inner + side * 0.03, outer - side * 0.02
+        glass = np.array([(back, near, low + 0.04), (back, far, low + 0.02), (back, far, low + 0.13),
+                          (back, near, low + 0.12)])  # fmt: skip
         make.detail(glass, (-1, 0, 0), part, (78, 88, 100), gloss=0.2)
         named[f"mirror_edge_{word}"] = np.array([x + 0.01, outer, low + 0.075])
     return named

@@ -68,7 +68,7 @@ def path_from_bends(bends: Sequence[tuple[float, float, float]], *, length_m: fl
     middle = 0.5 * (heading[1:] + heading[:-1])
     steps = np.stack([np.sin(middle), np.cos(middle)], -1) * _STEP_M
     points = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    origin = int(round(_LEAD_IN_M / _STEP_M))
+    origin = round(_LEAD_IN_M / _STEP_M)
     return StreetPath(
         start_m=-_LEAD_IN_M, step_m=_STEP_M, points_xz=_about(points, heading, origin),
         heading=heading - heading[origin], elevation=np.zeros_like(arc), bend=curvature,

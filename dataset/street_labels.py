@@ -8,7 +8,7 @@ import numpy as np
 
 from dataset.street_actors import Actor
 from dataset.street_drives import StreetPath
-from dataset.street_raster import Canvas
+from dataset.street_polygons import Canvas
 from dataset.street_scene import LaneLine
 from labeling.camera import Intrinsics
 from labeling.schemas import Category
@@ -86,8 +86,7 @@ def label_actors(
 
 
 def owner_boxes(owner: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(count,) pixels per owner and (count, 4) float32 boxes around them, by two passes of row and column sums."""
-    height, width = owner.shape
+    """(count,) pixels per owner and (count, 4) float32 boxes around them, over outer edges of pixels."""
     pixels = np.bincount(owner.ravel(), minlength=count)
     boxes = np.zeros((count, 4), np.float32)
     for index in np.flatnonzero(pixels[:count]):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from dataset.street_raster import ALL_SOFT, MAX_CORNERS, Polygons
+from dataset.street_polygons import ALL_SOFT, MAX_CORNERS, Polygons
 
 _RING = 8
 COCO17_NAMES = (
@@ -46,7 +46,11 @@ _HAIRS = ((40, 32, 28), (86, 60, 40), (24, 22, 24), (168, 134, 84), (140, 136, 1
 
 def random_look(rng: np.random.Generator) -> PersonLook:
     """Somebody."""
-    pick = lambda table: tuple(float(c) for c in table[int(rng.integers(len(table)))])  # noqa: E731
+
+    def pick(table: tuple[tuple[int, int, int], ...]) -> tuple[float, float, float]:
+        red, green, blue = table[int(rng.integers(len(table)))]
+        return float(red), float(green), float(blue)
+
     return PersonLook(
         height=float(rng.uniform(1.58, 1.9)), top=pick(_TOPS), trousers=pick(_TROUSERS), skin=pick(_SKINS),
         hair=pick(_HAIRS), shoes=pick(((40, 36, 34), (220, 220, 220), (110, 70, 44))), sleeves=bool(rng.random() < 0.6),
@@ -102,7 +106,10 @@ class Limbs:
 def limbs(look: PersonLook, points: np.ndarray) -> Limbs:
     """The prisms of a body with the given joints (17, 3)."""
     h = look.height
-    at = lambda name: points[_INDEX[name]]  # noqa: E731
+
+    def at(name: str) -> np.ndarray:
+        return points[_INDEX[name]]
+
     rows: list[tuple] = []
     for word in ("left", "right"):
         shoulder, elbow, wrist = at(f"{word}_shoulder"), at(f"{word}_elbow"), at(f"{word}_wrist")
@@ -112,8 +119,10 @@ def limbs(look: PersonLook, points: np.ndarray) -> Limbs:
         toe = ankle + np.array([0.10 * h, 0.0, -0.028 * h])
         heel = ankle + np.array([-0.025 * h, 0.0, -0.022 * h])
         rows += [
-            (hip, knee, (0.053, 0.050, 0.038, 0.036), look.trousers), (knee, ankle, (0.038, 0.036, 0.026, 0.025), look.trousers),
-            (heel, toe, (0.024, 0.026, 0.014, 0.026), look.shoes), (shoulder, elbow, (0.034, 0.032, 0.027, 0.025), look.top),
+            (hip, knee, (0.053, 0.050, 0.038, 0.036), look.trousers),
+            (knee, ankle, (0.038, 0.036, 0.026, 0.025), look.trousers),
+            (heel, toe, (0.024, 0.026, 0.014, 0.026), look.shoes),
+            (shoulder, elbow, (0.034, 0.032, 0.027, 0.025), look.top),
             (elbow, wrist, (0.026, 0.024, 0.020, 0.018), fore), (wrist, hand, (0.018, 0.014, 0.016, 0.010), look.skin),
         ]  # fmt: skip
     middle = 0.5 * (at("left_hip") + at("right_hip"))
@@ -121,7 +130,10 @@ def limbs(look: PersonLook, points: np.ndarray) -> Limbs:
     waist, top = middle + (chest - middle) * 0.38, chest + np.array([0, 0, 0.022 * h])
     breast = middle + (chest - middle) * 0.86
     crown = chest + np.array([0.004 * h, 0.0, 0.0])
-    lift = lambda share: crown + np.array([0.006 * h, 0.0, share * h])  # noqa: E731
+
+    def lift(share: float) -> np.ndarray:
+        return crown + np.array([0.006 * h, 0.0, share * h])
+
     rows += [
         (middle + np.array([0, 0, -0.035 * h]), waist, (0.062, 0.094, 0.058, 0.084), look.trousers),
         (middle + np.array([0, 0, 0.03 * h]), breast, (0.064, 0.092, 0.066, 0.116), look.top),
@@ -136,7 +148,11 @@ def limbs(look: PersonLook, points: np.ndarray) -> Limbs:
     head = np.zeros(len(rows), bool)
     head[body:] = True
     return Limbs(
-        start=np.array(start), end=np.array(end), radii=np.array(radii) * h, colour=np.array(colour, np.float32), head=head
+        start=np.array(start),
+        end=np.array(end),
+        radii=np.array(radii) * h,
+        colour=np.array(colour, np.float32),
+        head=head,
     )
 
 
@@ -149,9 +165,12 @@ def _rings(parts: Limbs) -> tuple[np.ndarray, np.ndarray]:
     front = np.cross(side, along)
     angle = (np.arange(_RING) + 0.5) * 2 * np.pi / _RING
     c, s = np.cos(angle)[None, :, None], np.sin(angle)[None, :, None]
-    ring = lambda centre, a, b: (  # noqa: E731
-        centre[:, None] + c * front[:, None] * a[:, None, None] + s * side[:, None] * b[:, None, None]
-    )
+
+    def ring(centre: np.ndarray, forward: np.ndarray, sideways: np.ndarray) -> np.ndarray:
+        return (
+            centre[:, None] + c * front[:, None] * forward[:, None, None] + s * side[:, None] * sideways[:, None, None]
+        )
+
     return ring(parts.start, *parts.radii[:, :2].T), ring(parts.end, *parts.radii[:, 2:].T)
 
 
@@ -193,7 +212,8 @@ def person_polygons(
     return Polygons(
         corners=placed.astype(np.float32), corner_count=number, colour=lit, texture=np.full(total, -1, np.int32),
         gradient=np.zeros((total, 2, 4), np.float32), owner=np.full(total, owner, np.int32),
-        alpha=np.ones(total, np.float32), grow_px=np.full(total, 0.4, np.float32), soft=np.full(total, ALL_SOFT, np.int32),
+        alpha=np.ones(total, np.float32), grow_px=np.full(total, 0.4, np.float32),
+        soft=np.full(total, ALL_SOFT, np.int32),
         fog=np.ones(total, np.float32),
     ).take(np.flatnonzero(outward))  # fmt: skip
 
@@ -202,7 +222,11 @@ def _face(look: PersonLook, points: np.ndarray) -> np.ndarray:
     """Eyes, nose and ears as small quads just off the head: (5, MAX_CORNERS, 3)."""
     h = look.height
     quads = np.zeros((5, MAX_CORNERS, 3))
-    for row, name, half_y, half_z in ((0, "left_eye", 0.007, 0.0045), (1, "right_eye", 0.007, 0.0045), (2, "nose", 0.007, 0.011)):
+    for row, name, half_y, half_z in (
+        (0, "left_eye", 0.007, 0.0045),
+        (1, "right_eye", 0.007, 0.0045),
+        (2, "nose", 0.007, 0.011),
+    ):
         x, y, z = points[_INDEX[name]]
         a, b = half_y * h, half_z * h
         quads[row, :4] = [(x, y - a, z - b), (x, y + a, z - b), (x, y + a, z + b), (x, y - a, z + b)]

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dataset.street_drives import StreetPath
-from dataset.street_raster import ALL_SOFT, NO_TEXTURE, Polygons, join, make_polygons
+from dataset.street_polygons import ALL_SOFT, NO_TEXTURE, Polygons, join, make_polygons
+from dataset.street_props import column, frontal_wall, lamp_post, sunlight, tree, wall_polygon
 from dataset.street_textures import FACADES, GROUND_FLOORS, TEXTURE_METRES, TextureName, texture_index, texture_size
 
 LANE_WIDTH_M = 3.5
@@ -103,9 +104,9 @@ def build_world(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, *,
     if plan.trees:
         things += _furniture(path, plan, rng, sun)
     if plan.wall:
-        things.append(_frontal_wall(path))
+        things.append(frontal_wall(path))
     if plan.column:
-        things.append(_column(path, sun))
+        things.append(column(path, sun))
     boxes = np.array([_box(thing) for thing in things]).reshape(-1, 2, 3)
     return StillWorld(
         ground=ground, ground_middle=_middles(ground), things=tuple(things),
@@ -182,10 +183,11 @@ def _ribbon(path: StreetPath, arcs: np.ndarray, left: float, right: float) -> li
 def _ribbons(path: StreetPath, plan: StreetPlan) -> list[Polygons]:
     arcs = _stations(path, path.start_m + 1, path.end_m - 1)
     kerb, gutter, yard = 0.28, 0.12, 9.0 if plan.buildings else 0.0  # In the open the verge is grass.
-    strips = [("asphalt", 255.0, plan.left_m, plan.right_m)]
+    strips: list[tuple[TextureName, float, float, float]] = [("asphalt", 255.0, plan.left_m, plan.right_m)]
+    beside: tuple[tuple[TextureName, float], ...] = (("asphalt", 140.0), ("pavement", 290.0), ("pavement", 250.0))
     for side, edge in ((-1, plan.left_m), (1, plan.right_m)):
         cuts = (edge, edge + side * gutter, edge + side * (gutter + kerb), edge + side * (plan.pavement_m + yard))
-        for name, shade, a, b in zip(("asphalt", "pavement", "pavement"), (140.0, 290.0, 250.0), cuts, cuts[1:], strict=False):
+        for (name, shade), a, b in zip(beside, cuts[:-1], cuts[1:], strict=True):
             if abs(b - a) > 0.05 and (plan.buildings or shade != 250.0):
                 strips.append((name, shade, min(a, b), max(a, b)))
     return [
@@ -208,30 +210,12 @@ def _markings(path: StreetPath, plan: StreetPlan) -> list[Polygons]:
         else:
             quads = _ribbon(path, _stations(path, path.start_m + 1, path.end_m - 1, longest=4.0), *edges)
         colour = _YELLOW if line.yellow else _WHITE
-        parts.append(make_polygons(quads, colour=colour, grow_px=0.3 if line.dashed else 0.0, soft=ALL_SOFT if line.dashed else _SIDES))
+        parts.append(
+            make_polygons(
+                quads, colour=colour, grow_px=0.3 if line.dashed else 0.0, soft=ALL_SOFT if line.dashed else _SIDES
+            )
+        )
     return parts
-
-
-def _shade(normal: np.ndarray, sun: np.ndarray) -> float:
-    return float(0.80 + 0.26 * max(-0.5, normal @ sun))
-
-
-def wall_polygon(
-    foot: np.ndarray, along: np.ndarray, *, width: float, bottom: float, top: float, name: TextureName,
-    tint: np.ndarray, shift_m: float = 0.0,
-) -> Polygons:  # fmt: skip
-    """An upright textured rectangle from ``foot`` (3,) along the unit vector ``along`` (3,); heights above the foot."""
-    up = np.array([0.0, -1.0, 0.0])
-    corners = np.array([
-        foot + up * bottom, foot + along * width + up * bottom, foot + along * width + up * top, foot + up * top
-    ])  # fmt: skip
-    size, metres = texture_size(name), TEXTURE_METRES[name]
-    per_m = (size[0] / metres[0], size[1] / metres[1])
-    gradient = np.array([
-        [*(along * per_m[0]), (shift_m - foot @ along) * per_m[0]],
-        [0, per_m[1], 0, -(foot[1] - bottom) * per_m[1]],
-    ], np.float32)  # fmt: skip
-    return make_polygons([corners], colour=tint, texture=texture_index(name), gradient=gradient)
 
 
 def _building(
@@ -247,14 +231,16 @@ def _building(
     depth = float(rng.uniform(6, 11))
     foot = middle - forward * width / 2
     tint = np.clip(rng.normal(1.0, 0.09) + rng.normal(0, 0.05, 3), 0.7, 1.15) * 255
-    front = tint * _shade(-side * right, sun)
+    front = tint * sunlight(-side * right, sun)
     name = FACADES[int(rng.integers(len(FACADES)))]
     below = GROUND_FLOORS[int(rng.random() < 0.45)]
     shift = float(rng.integers(0, 4)) * 3.2
     parts = []
     for start, direction in ((foot, -forward), (foot + forward * width, forward)):
         parts.append(
-            wall_polygon(start, right * side, width=depth, bottom=0, top=top, name="wall", tint=tint * _shade(direction, sun))
+            wall_polygon(
+                start, right * side, width=depth, bottom=0, top=top, name="wall", tint=tint * sunlight(direction, sun)
+            )
         )
     common = {"tint": front, "shift_m": shift}
     parts.append(wall_polygon(foot, forward, width=width, bottom=ground_m, top=top, name=name, **common))
@@ -301,104 +287,6 @@ def _beside_road(path: StreetPath, plan: StreetPlan, spots_xz: np.ndarray, *, ma
     return not on_road.any()
 
 
-def _frontal_wall(path: StreetPath) -> Polygons:
-    spot, heading = path.at(14.0)
-    right = np.array([np.cos(heading), 0.0, -np.sin(heading)])
-    common = {"width": 240.0, "tint": np.full(3, 245.0)}
-    foot = spot - right * 120
-    return join([
-        wall_polygon(foot, right, bottom=3.6, top=30.0, name="brick", **common),
-        wall_polygon(foot, right, bottom=0.0, top=3.6, name="shutters", **common),
-    ])  # fmt: skip
-
-
-COLUMN_AHEAD_M, COLUMN_LATERAL_M, COLUMN_RADIUS_M = 8.5, -1.9, 0.7
-"""Where the advertising column stands, from the camera's start."""
-
-
-def _column(path: StreetPath, sun: np.ndarray) -> Polygons:
-    foot, _ = path.at(COLUMN_AHEAD_M, COLUMN_LATERAL_M)
-    post = _prism(foot, radius=COLUMN_RADIUS_M, height=3.0, colour=(200, 196, 184), sun=sun, sides=12)
-    posters = np.array([(198, 66, 58), (232, 204, 90), (66, 120, 168), (236, 232, 222)], np.float32)
-    sheets = _prism(
-        foot - (0.0, 0.7, 0.0), radius=COLUMN_RADIUS_M + 0.01, height=1.8, colour=posters[np.arange(12) % 4], sun=sun,
-        sides=12,
-    )  # fmt: skip
-    return join([post, sheets])
-
-
-def _prism(
-    foot: np.ndarray, *, radius: float, height: float, colour: np.ndarray | tuple[float, float, float], sun: np.ndarray,
-    top_radius: float | None = None, sides: int = 6,
-) -> Polygons:  # fmt: skip
-    """An upright tapered prism; all its sides, so that it can be painted from anywhere (back sides are culled later)."""
-    angle = np.arange(sides + 1) * 2 * np.pi / sides
-    ring = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], -1)
-    upper = foot + ring * (radius if top_radius is None else top_radius) - (0.0, height, 0.0)
-    lower = foot + ring * radius
-    quads = [np.array([lower[k], lower[k + 1], upper[k + 1], upper[k]]) for k in range(sides)]
-    middle = angle[:-1] + np.pi / sides
-    shade = np.array([_shade(np.array([np.cos(m), 0.0, np.sin(m)]), sun) for m in middle])
-    return make_polygons(quads, colour=np.asarray(colour, np.float32) * shade[:, None].astype(np.float32), grow_px=0.4)
-
-
-def _blob(centre: np.ndarray, radius: float, rng: np.random.Generator, sun: np.ndarray, green: np.ndarray) -> Polygons:
-    """A crown: a ball of triangles with shades of leaf, slightly out of round."""
-    rows, around = 5, 9
-    polar = np.linspace(0, np.pi, rows + 1)
-    turn = np.arange(around) * 2 * np.pi / around
-    nodes = np.stack([
-        np.sin(polar)[:, None] * np.cos(turn), np.broadcast_to(-np.cos(polar)[:, None] * 0.9, (rows + 1, around)),
-        np.sin(polar)[:, None] * np.sin(turn),
-    ], -1)  # fmt: skip
-    size = radius * rng.uniform(0.86, 1.1, (rows + 1, around))
-    size[0], size[-1] = size[0, 0], size[-1, 0]
-    nodes = centre + nodes * size[..., None]
-    after = np.roll(nodes, -1, axis=1)
-    upper = np.stack([nodes[1:-1], after[1:-1], after[2:]], axis=2)
-    lower = np.stack([nodes[:-2], after[1:-1], nodes[1:-1]], axis=2)
-    faces = np.concatenate([upper.reshape(-1, 3, 3), lower.reshape(-1, 3, 3)])
-    normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
-    inward = np.einsum("ij,ij->i", normal, faces.mean(axis=1) - centre) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    normal[inward] *= -1
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    shade = 0.95 + 0.35 * np.clip(normal @ sun, -0.8, 1) - 0.12 * np.clip(normal[:, 1], 0, 1)
-    shade += rng.normal(0, 0.02, len(faces))
-    across = np.cross(normal, (0.0, 1.0, 0.0)) + (1e-6, 0.0, 0.0)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    per_m = texture_size("leaves")[0] / TEXTURE_METRES["leaves"][0]
-    gradient = np.zeros((len(faces), 2, 4))
-    gradient[:, 0, :3], gradient[:, 1, :3] = across * per_m, np.cross(normal, across) * per_m
-    gradient[:, :, 3] = -np.einsum("nij,j->ni", gradient[:, :, :3], centre) + rng.uniform(0, 256, (1, 2))
-    return make_polygons(
-        faces, colour=green * shade[:, None], texture=texture_index("leaves"), gradient=gradient, grow_px=0.4
-    )
-
-
-def _tree(spot: np.ndarray, rng: np.random.Generator, sun: np.ndarray) -> Polygons:
-    height = float(rng.uniform(2.2, 3.2))
-    green = np.array([134, 158, 104]) * rng.uniform(0.85, 1.2) + rng.normal(0, 6, 3)
-    parts = [_prism(spot, radius=0.16, top_radius=0.10, height=height + 0.6, colour=(96, 78, 62), sun=sun)]
-    for _ in range(3):
-        centre = spot + (rng.normal(0, 0.45), -height - rng.uniform(0.5, 1.8), rng.normal(0, 0.45))
-        parts.append(_blob(centre, float(rng.uniform(1.0, 1.5)), rng, sun, green))
-    return join(parts)
-
-
-def _lamp(spot: np.ndarray, to_road: np.ndarray, sun: np.ndarray) -> Polygons:
-    grey = (92.0, 98.0, 100.0)
-    pole = _prism(spot, radius=0.085, top_radius=0.055, height=6.4, colour=grey, sun=sun)
-    tip = spot - (0.0, 6.35, 0.0)
-    side = np.array([to_road[2], 0.0, -to_road[0]])
-    arm = [np.array([tip, tip + to_road * 1.6, tip + to_road * 1.6 + (0, 0.1, 0), tip + (0, 0.1, 0)])]
-    head = tip + to_road * 1.5
-    lamp = [np.array([head - side * 0.12, head + side * 0.12, head + side * 0.12 + to_road * 0.6, head - side * 0.12 + to_road * 0.6])]
-    arm += [arm[0][::-1]]
-    lamp += [lamp[0][::-1]]
-    return join([pole, make_polygons(arm, colour=grey), make_polygons(lamp, colour=(236.0, 232.0, 214.0))])
-
-
 def _furniture(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun: np.ndarray) -> list[Polygons]:
     """Trees and lamps along both kerbs, never on another stretch of the road."""
     things = []
@@ -408,7 +296,7 @@ def _furniture(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun
             lamp = rng.random() < 0.3
             spot, heading = path.at(arc, side * (kerb + (0.6 if plan.buildings else float(rng.uniform(1.0, 6.0)))))
             right = np.array([np.cos(heading), 0.0, -np.sin(heading)])
-            thing = _lamp(spot, -side * right, sun) if lamp else _tree(spot, rng, sun)
+            thing = lamp_post(spot, -side * right, sun) if lamp else tree(spot, rng, sun)
             bends = float(path.curvature(np.array(arc))) * side
             if bends < 0.5 / kerb and _beside_road(path, plan, spot[None, [0, 2]], margin_m=0.2):
                 things.append(thing)

@@ -9,13 +9,25 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from dataset.street_raster import Atlas, pack_rgb
+from dataset.street_polygons import Atlas, pack_rgb
 
 TextureName = Literal[
-    "asphalt", "pavement", "grass", "sky", "plaster", "brick", "concrete", "stucco", "shop", "shutters", "wall", "leaves",
+    "asphalt",
+    "pavement",
+    "grass",
+    "sky",
+    "plaster",
+    "brick",
+    "concrete",
+    "stucco",
+    "shop",
+    "shutters",
+    "wall",
+    "leaves",
 ]
 TEXTURES: tuple[TextureName, ...] = (
-    "asphalt", "pavement", "grass", "sky", "plaster", "brick", "concrete", "stucco", "shop", "shutters", "wall", "leaves",
+    "asphalt", "pavement", "grass", "sky", "plaster", "brick", "concrete", "stucco", "shop", "shutters", "wall",
+    "leaves",
 )  # fmt: skip
 FACADES: tuple[TextureName, ...] = ("plaster", "brick", "concrete", "stucco")
 GROUND_FLOORS: tuple[TextureName, ...] = ("shop", "shutters")
@@ -45,7 +57,8 @@ def street_atlas() -> Atlas:
     """All textures with their mip chains, each level the mean over 2x2 texels of the one before."""
     painters = {
         "asphalt": _asphalt, "pavement": _pavement, "grass": _grass, "sky": _sky, "plaster": _plaster, "brick": _brick,
-        "concrete": _concrete, "stucco": _stucco, "shop": _shop, "shutters": _shutters, "wall": _wall, "leaves": _leaves,
+        "concrete": _concrete, "stucco": _stucco, "shop": _shop, "shutters": _shutters, "wall": _wall,
+        "leaves": _leaves,
     }  # fmt: skip
     count = len(TEXTURES)
     offset, levels = np.zeros((count, _LEVELS), np.int64), np.zeros(count, np.int32)
@@ -65,7 +78,11 @@ def street_atlas() -> Atlas:
                 break
             picture = picture.reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
     return Atlas(
-        texels=np.concatenate(chunks), offset=offset, log_width=log_width, log_height=log_height, levels=levels,
+        texels=np.concatenate(chunks),
+        offset=offset,
+        log_width=log_width,
+        log_height=log_height,
+        levels=levels,
         taps=np.array([1 if name in _PLAIN else 2 for name in TEXTURES], np.int32),
     )
 

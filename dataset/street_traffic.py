@@ -149,7 +149,9 @@ def _lane_traffic(cast: _Cast, lateral: float, direction: int, share: float) -> 
         pace, phase = float(rng.uniform(0.2, 0.5)), float(rng.uniform(0, 6))
         for place in np.arange(-14.0, 110.0, 14.0):
             if rng.random() < share:
-                cast.car_on_road(arc + place + rng.uniform(-2, 2) + 1.8 * np.sin(pace * time + phase), lateral + wobble, 1)
+                cast.car_on_road(
+                    arc + place + rng.uniform(-2, 2) + 1.8 * np.sin(pace * time + phase), lateral + wobble, 1
+                )
         return
     speed = float(rng.uniform(6, 12))
     first = arc.min() - 20 + float(rng.uniform(0, 16))

@@ -78,7 +78,11 @@ def test_a_tracker_confirms_the_true_flow_at_every_depth(scenario: Scenario) -> 
             guess = (spots + flow[y, x]).astype(np.float32)[:, None]
             there, good, _ = cv2.calcOpticalFlowPyrLK(one, two, corners, guess.copy(), flags=0, **options)
             back, again, _ = cv2.calcOpticalFlowPyrLK(two, one, there, np.empty(0), **options)
-            kept = (good & again).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=2).ravel() < 0.5)
+            kept = (
+                (np.asarray(good) > 0).ravel()
+                & (np.asarray(again) > 0).ravel()
+                & (np.linalg.norm(back - corners, axis=2).ravel() < 0.5)
+            )
             found.append(np.linalg.norm((there - corners)[:, 0] - flow[y, x], axis=1)[kept])
     for band, found in errors.items():
         every = np.concatenate(found)
@@ -108,7 +112,9 @@ def test_cars_hide_their_own_far_side() -> None:
     for shape in CAR_SHAPES:
         model = car_model(shape)
         from_behind = dict(zip(names, ~hidden_by_itself(model, np.array([-12.0, 0.0, 1.5])), strict=True))
-        assert all(from_behind[f"rear_{part}_{side}"] for part in ("light", "plate", "low") for side in ("left", "right"))
+        assert all(
+            from_behind[f"rear_{part}_{side}"] for part in ("light", "plate", "low") for side in ("left", "right")
+        )
         assert not any(from_behind[f"front_{part}_{side}"] for part in ("light", "low") for side in ("left", "right"))
         from_left = dict(zip(names, ~hidden_by_itself(model, np.array([1.0, 9.0, 1.5])), strict=True))
         assert from_left["front_wheel_left"] and from_left["rear_wheel_left"] and from_left["mirror_edge_left"]
@@ -157,7 +163,9 @@ def test_somebody_who_passes_behind_the_column_is_gone_for_about_a_second() -> N
             if thing.category == "person" and thing.distance_m < 25:
                 shares.setdefault(thing.track_id, {})[i] = thing.visible_share
     assert len(shares) == 2
-    gone = {track: [i for i in range(min(s), max(s)) if i % 2 == 0 and s.get(i, 0.0) < 0.02] for track, s in shares.items()}
+    gone = {
+        track: [i for i in range(min(s), max(s)) if i % 2 == 0 and s.get(i, 0.0) < 0.02] for track, s in shares.items()
+    }
     longest = max(len(frames) * 2 for frames in gone.values())
     assert 16 <= longest <= 40
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from dataset.street_raster import Atlas, blank_canvas, make_polygons, pack_rgb, paint
+from dataset.street_polygons import Atlas, blank_canvas, join, make_polygons, pack_rgb
+from dataset.street_raster import paint
 
 CAMERA = (100.0, 100.0, 49.5, 39.5)
 WIDTH, HEIGHT = 100, 80
@@ -120,8 +121,6 @@ def test_owners_and_counts() -> None:
     far, near = picture_polygon(square, np.full(4, 6.0)), picture_polygon(square + 20, np.full(4, 3.0))
     both = make_polygons([far], owner=1), make_polygons([near], owner=2)
     first, _ = render(both[0])
-    from dataset.street_raster import join
-
     canvas, (drawn, rejected) = render(join(list(both)))
     assert drawn[1] == (first.owner == 1).sum()
     assert (canvas.owner == 1).sum() < drawn[1]
