@@ -2,7 +2,7 @@
 
 Runs are interleaved; medians of processor time (all threads) and wall time go to ``results/batches.json``: YOLOX-nano
 on real frames, a whole-body SimCC head of random weights, and every shipped street model whose weights are there. On a
-machine with a GPU, ``--providers cuda`` measures that.
+machine with a GPU, ``--providers cuda`` measures that. Wall times mean something on a quiet machine only: see the load.
 
     python tests/benchmarks/bench_batches.py [--rounds 7] [--providers cpu] [--parity]
 """
@@ -56,7 +56,8 @@ def main() -> None:
     report = {
         "what": f"ms per frame (detectors, fields) or crop (heads), {FRAMES} of them, pre- and postprocessing included",
         "providers": given.providers, "rounds": given.rounds, "cases": cases,
-        "machine": {"cpu": platform.machine(), "cores": os.cpu_count(), "onnxruntime": onnxruntime.__version__},
+        "machine": {"cpu": platform.machine(), "cores": os.cpu_count(), "onnxruntime": onnxruntime.__version__,
+                    "load_average": round(os.getloadavg()[0], 1)},
     }  # fmt: skip
     (RESULTS / "batches.json").write_text(json.dumps(report, indent=2) + "\n")
 
