@@ -51,7 +51,7 @@ def toy_pool() -> StreetPool:
         for lane in lanes:
             for x, y in (lane.points_xy / 2).round().astype(int):
                 half[y - 1 : y + 2, x - 1 : x + 2] = 255
-        frames.append(PoolFrame(half=half, objects=lanes))
+        frames.append(PoolFrame(picture=half, scale=0.5, objects=lanes))
     return StreetPool(frames=tuple(frames), crops={"car": (), "person": (), "lane": ()})
 
 
@@ -163,7 +163,9 @@ def field_batch_loss(network: torch.nn.Module, batch: Batch) -> torch.Tensor:
 
 def test_a_short_training_lowers_the_loss_and_repeats_with_its_seed(toy_pool: StreetPool) -> None:
     clear = AugmentSettings(dusk=0, night=0, blur=0, weather=0, noise=0, compression=0)
-    batches = FieldBatches(pool=toy_pool, schemas=("lane24",), size=(257, 193), count=2, augment=clear)
+    batches = FieldBatches(
+        pool=toy_pool, schemas=("lane24",), size=(257, 193), count=2, augment=clear, scales=(0.9, 1.1)
+    )
     probe = batches(np.random.default_rng(0))
 
     def probe_loss(network: torch.nn.Module) -> float:
@@ -280,7 +282,7 @@ def test_the_pool_holds_what_the_street_shows() -> None:
     (plan,) = plan_streets(500, 1, frames=1)
     pool = render_pool([plan], workers=1)
     truth = Street(plan.config).render(plan.frames[0])
-    np.testing.assert_array_equal(pool.frames[0].half, cv2.resize(truth.rgb, (528, 352)))
+    np.testing.assert_array_equal(pool.frames[0].picture, cv2.resize(truth.rgb, (672, 448)))
     assert [thing.category for thing in pool.frames[0].objects] == [thing.category for thing in truth.objects]
     kept = [crop for crops in pool.crops.values() for crop in crops]
     assert kept

@@ -73,7 +73,7 @@ def simcc_loss(
 
 
 def field_loss(field: Tensor, places: Tensor, values: Tensor) -> Tensor:
-    """Focal loss of the confidences, smooth L1 of offsets and scales where there is something.
+    """Cross-entropy of the confidences, smooth L1 of offsets and scales where there is something.
 
     Args:
         field: cif (N, K, 4, h, w) or caf (N, E, 7, h, w) as ``FieldNetwork`` gives it.
@@ -85,12 +85,11 @@ def field_loss(field: Tensor, places: Tensor, values: Tensor) -> Tensor:
     confidence = field[:, :, 0].float()
     target = torch.zeros_like(confidence)
     target[picture, row, y, x] = 1
-    entropy = functional.binary_cross_entropy_with_logits(confidence, target, reduction="none")
-    # Lin et al. 2017 with gamma 1: easy background is nearly all there is.
-    entropy = entropy * (1 - (-entropy).exp())
+    # Not focal: the decoder adds confidences up, and focal loss leaves them timid.
+    entropy = functional.binary_cross_entropy_with_logits(confidence, target, reduction="sum")
     parts = torch.arange(1, 1 + width)
     picked = field[picture[:, None], row[:, None], parts, y[:, None], x[:, None]].float()
     offsets = 2 * width // 3
     places_off = functional.smooth_l1_loss(picked[:, :offsets], values[:, :offsets], beta=0.1, reduction="sum")
     scales_off = functional.l1_loss(picked[:, offsets:], values[:, offsets:], reduction="sum")
-    return 4 * entropy.sum() / count + (places_off + 0.2 * scales_off) / (width // 3 * count)
+    return 3 * entropy / count + (places_off + 0.2 * scales_off) / (width // 3 * count)

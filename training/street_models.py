@@ -36,7 +36,7 @@ from training.street_networks import (
     SimccNetwork,
     StreetDetector,
 )
-from training.street_pool import RenderPlan, StreetPool, render_pool, truths_of
+from training.street_pool import PICTURE_SIZE, RenderPlan, StreetPool, render_pool, truths_of
 from training.street_scores import StreetModels, Tally, judge_frame
 from training.street_targets import grid_cells
 
@@ -51,7 +51,7 @@ PLANNED: tuple[Scenario, ...] = (
     "traffic", "lead_leaves", "parked", "fast", "sharp_turn", "reverse", "empty", "wall", "road_only", "still",
 )  # fmt: skip
 """Scenarios in turn; busy ones come more often."""
-_DETECTOR_SIZE, _WINDOW = (544, 352), (352, 256)
+_WINDOW = (352, 256)
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
 _FIELD_SIZE = (529, 353)
 _LICENCE = "Apache-2.0"
@@ -117,8 +117,8 @@ def _detector_recipe(seed: int, share: float) -> Recipe:
 
     card = YoloxCard(
         name="street_detector", file="street_detector.onnx", licence=_LICENCE, source=_SOURCE, classes=CLASSES,
-        categories={name: name for name in CLASSES}, input_width=_DETECTOR_SIZE[0], input_height=_DETECTOR_SIZE[1],
-        score_threshold=0.35, nms_threshold=0.45,
+        categories={name: name for name in CLASSES}, input_width=PICTURE_SIZE[0], input_height=PICTURE_SIZE[1],
+        score_threshold=0.3, nms_threshold=0.45,
     )  # fmt: skip
     return Recipe(
         card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph,
@@ -146,7 +146,7 @@ def _head_recipe(name: str, schema: str, seed: int, share: float) -> Recipe:
         batches=lambda pool: CropBatches(
             crops=pool.crops[category], schema=schema, size=size, count=64, augment=augment
         ),
-        fit=FitSettings(name=name, seed=seed, steps=_steps(2200, share)),
+        fit=FitSettings(name=name, seed=seed, steps=_steps(1100 if category == "car" else 1600, share)),
     )  # fmt: skip
 
 
@@ -174,7 +174,7 @@ def _field_recipe(name: str, schemas: tuple[str, ...], seed: int, share: float) 
         batches=lambda pool: FieldBatches(
             pool=pool, schemas=schemas, size=_FIELD_SIZE, count=8, augment=AugmentSettings()
         ),
-        fit=FitSettings(name=name, seed=seed, steps=_steps(2000, share)),
+        fit=FitSettings(name=name, seed=seed, steps=_steps(1800, share)),
     )  # fmt: skip
 
 

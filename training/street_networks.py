@@ -83,7 +83,7 @@ class Pyramid(nn.Module):
 class StreetDetector(nn.Module):
     """A YOLOX-like detector: one prediction per cell of strides 8, 16 and 32, one head shared by all of them."""
 
-    def __init__(self, classes: int, *, widths: Sequence[int] = (24, 40, 72, 112), width: int = 48) -> None:
+    def __init__(self, classes: int, *, widths: Sequence[int] = (32, 48, 72, 112), width: int = 48) -> None:
         super().__init__()
         self.trunk = Trunk(widths, (1, 1, 1))
         self.pyramid = Pyramid(widths[1:], width)

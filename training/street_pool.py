@@ -1,4 +1,4 @@
-"""Street frames rendered once and kept in memory: half-size pictures for detector and fields, crops for the heads."""
+"""Street frames rendered once and kept in memory: smaller pictures for detector and fields, crops for the heads."""
 
 import functools
 from collections.abc import Iterable, Sequence
@@ -12,6 +12,8 @@ import numpy as np
 from dataset.street import Street, StreetConfig, StreetFrame
 from labeling.schemas import Category
 
+PICTURE_SIZE = (672, 448)
+"""Width and height at which frames are kept: the detector's input; 7/11 of 1056x704."""
 CROP_MARGIN = 1.8
 """Side of a stored crop relative to the object's box, so that it can still be moved, turned and scaled."""
 CROP_LIMIT_PX = 360
@@ -43,10 +45,12 @@ class ObjectTruth:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoolFrame:
-    """One frame at half size with its truth at full size."""
+    """One frame, scaled down, with its truth at full size."""
 
-    half: np.ndarray
-    """(H/2, W/2, 3) uint8 RGB."""
+    picture: np.ndarray
+    """(448, 672, 3) uint8 RGB."""
+    scale: float
+    """Picture pixels per frame pixel."""
     objects: tuple[ObjectTruth, ...]
 
 
@@ -125,9 +129,8 @@ def _render_street(
     for index in plan.frames:
         frame = street.render(index)
         objects = truths_of(frame)
-        height, width = frame.rgb.shape[:2]
-        half = cv2.resize(frame.rgb, (width // 2, height // 2), interpolation=cv2.INTER_LINEAR)
-        frames.append(PoolFrame(half=half, objects=objects))
+        picture = cv2.resize(frame.rgb, PICTURE_SIZE, interpolation=cv2.INTER_LINEAR)
+        frames.append(PoolFrame(picture=picture, scale=PICTURE_SIZE[0] / frame.rgb.shape[1], objects=objects))
         crops += _crops_of(frame.rgb, objects, least_crop_px, least_share)
     return frames, crops
 

@@ -17,7 +17,7 @@ from training.street_pool import ObjectTruth
 JUDGED_HEIGHT_PX = 32.0
 JUDGED_SHARE = 0.3
 PCK_SHARE = 0.1
-_MATCH_IOU = 0.5
+_MATCH_IOU = 0.3
 _EXCUSED_SHARE = 0.5
 _LANE_MATCH_PX = 20.0
 HIDDEN_SCORE = 0.3
