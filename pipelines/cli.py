@@ -56,6 +56,30 @@ def main() -> None:
 
 
 @app.command(rich_help_panel=LABEL)
+def plan(
+    videos: Videos,
+    config: ConfigFile = None,
+    effort: Effort = None,
+    keep_share: KeepShare = None,
+    models: Models = None,
+    extractors: Extractors = None,
+    workers: Workers = None,
+    parts: Annotated[int, typer.Option(min=1, help="Hosts that share the videos.")] = 1,
+    leave_out: LeaveOut = None,
+    as_json: AsJson = False,
+) -> None:
+    """What labelling would take, before anything is spent: clips, disk and hours, measured on a minute of the footage."""
+    from pipelines.commands import JobOptions
+    from pipelines.plan_console import show_plan
+
+    options = JobOptions(
+        config=config, effort=effort, keep_share=keep_share, models=models, extractors=extractors, workers=workers,
+        leave_out=leave_out,
+    )  # fmt: skip
+    raise typer.Exit(show_plan(videos, options, parts=parts, as_json=as_json))
+
+
+@app.command(rich_help_panel=LABEL)
 def label(
     out: Out,
     videos: MoreVideos = None,

@@ -1,7 +1,7 @@
 """What a job would take, before anything is spent: clips, disk and hours, from a minute of the footage itself.
 
-Lengths come from the videos' headers. Costs come from a small job on windows of the same videos, with the same settings, run
-twice in a scratch folder: the first time to load and compile, the second to be measured.
+Lengths come from the headers. Costs come from a small job on windows of the same videos, with the same settings,
+in a scratch folder; a still smaller one before it pays for loading and compiling.
 """
 
 import tempfile
@@ -141,7 +141,9 @@ def _lengths_s(sources: Sequence[Source]) -> tuple[dict[str, float], tuple[str, 
     broken = []
     for source in sources:
         try:
-            lengths[source.video_id] = max(0.0, probe(source.path).duration_s - sum(source.leave_out_s))
+            info = probe(source.path)
+            # The last frame is shown for its own time: the timeline ends where it begins.
+            lengths[source.video_id] = max(0.0, info.duration_s - 1 / info.frame_rate - sum(source.leave_out_s))
         except VideoError as error:
             broken.append(str(error))
     if not lengths:
@@ -206,11 +208,13 @@ class _Measured:
         if failed:
             raise ConfigError(f"a trial on the footage failed in {failed[0].stage}: {failed[0].message}")
         (chosen,) = receipts["select"].values()
-        clips = max(1, int(chosen.facts["clips"]))
+        kept = max(1, int(chosen.facts["kept"]))
+        # Clips outside the windows have rows in the selection too; where every clip is kept none is counted.
+        clips = sum(int(receipt.facts["clips"]) for receipt in receipts["count"].values()) or kept
         return cls(
             window_s=sum(float(receipt.facts["frames"]) for receipt in receipts["cut"].values()) / _FPS,
             video_s=sum(float(receipt.facts["seconds"]) for receipt in receipts["index"].values()),
-            clips=clips, kept_clips=max(1, int(chosen.facts["kept"])),
+            clips=clips, kept_clips=kept,
         )  # fmt: skip
 
 

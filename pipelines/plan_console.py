@@ -35,8 +35,8 @@ def show_plan(videos: Sequence[Path], options: JobOptions, *, parts: int, as_jso
     console.print(_table(plan))
     hosts = f"on each of {plan.parts} hosts (the busiest has {plan.largest_part:.0%})" if plan.parts > 1 else "here"
     console.print(
-        f"[bold]{hours(plan.hours_per_host)}[/] {hosts} with {plan.workers} workers, [bold]{size(plan.disk_bytes)}[/] of "
-        f"disk; measured on {plan.calibration_s:.0f} s of the footage"
+        f"[bold]{hours(plan.hours_per_host)}[/] {hosts} with {plan.workers} workers, "
+        f"[bold]{size(plan.disk_bytes)}[/] of disk; measured on {plan.calibration_s:.0f} s of the footage"
     )
     return 0
 

@@ -1,0 +1,84 @@
+"""The plan against the truth of the job that then runs: clips and bytes here, hours in a benchmark."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from pipeline_fixtures import SMALL, run_all, small_config, write_detector, write_street
+
+from dataset.selection import read_selection
+from labeling.errors import ConfigError
+from labeling.timeline import ClipSettings
+from pipelines.commands import JobOptions
+from pipelines.job import Job, Source, find_videos
+from pipelines.plan import count_candidates, plan_job, plan_windows
+from pipelines.plan_console import hours, show_plan, size
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("videos")
+    for seed in range(3):
+        write_street(folder / f"v{seed}.mp4", frames=96, level=80 + 40 * seed, seed=seed)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def options(tmp_path_factory: pytest.TempPathFactory) -> JobOptions:
+    folder = tmp_path_factory.mktemp("settings")
+    (folder / "small.yaml").write_text(yaml.safe_dump(SMALL))
+    return JobOptions(config=folder / "small.yaml", models=write_detector(folder / "models"), keep_share=0.3)
+
+
+def test_clips_and_bytes_are_within_thirty_percent(tmp_path: Path, videos: Path, options: JobOptions) -> None:
+    plan = plan_job([videos], options, workers=1, calibration_s=6.0)
+    sources = {source.video_id: source for source in find_videos([videos])}
+    job = Job(tmp_path / "J", small_config(select={"keep_share": 0.3}), sources, models_dir=options.models)
+    run_all(job)
+    chosen = read_selection(job.root / "selection.parquet")
+    assert plan.clips == len(chosen.rows)
+    assert plan.kept_clips == pytest.approx(len(chosen.kept), rel=0.3)
+    made = sum(path.stat().st_size for path in job.root.rglob("*") if path.is_file() and "receipts" not in path.parts)
+    assert plan.disk_bytes == pytest.approx(made, rel=0.3)
+    assert plan.core_hours > 0 and plan.hours_per_host == pytest.approx(plan.core_hours)
+
+
+def test_parts_share_the_footage(videos: Path, options: JobOptions, capsys: pytest.CaptureFixture[str]) -> None:
+    assert show_plan([videos], options, parts=2, as_json=True) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert 1 / 3 < plan["largest_part"] <= 1
+    assert plan["hours_per_host"] == pytest.approx(plan["core_hours"] * plan["largest_part"] / plan["workers"])
+
+
+def test_windows_lie_in_the_middle_and_add_up() -> None:
+    sources = [Source(video_id=f"v{i}", path=Path(f"v{i}.mp4"), leave_out_s=(10.0, 0.0)) for i in range(5)]
+    lengths = {source.video_id: 600.0 for source in sources}
+    windows = plan_windows(sources, lengths, clip=ClipSettings(), seconds=60)
+    assert len(windows) == 3
+    for window in windows:
+        start, end = window.leave_out_s
+        assert 610.0 - start - end == pytest.approx(20.0)
+        assert start - 10 == pytest.approx(end)
+
+
+def test_short_videos_give_all_they_have() -> None:
+    sources = [Source(video_id=f"v{i}", path=Path(f"v{i}.mp4")) for i in range(20)]
+    windows = plan_windows(sources, {s.video_id: 6.0 for s in sources}, clip=ClipSettings(), seconds=60)
+    assert len(windows) == 10 and all(window.leave_out_s == (0, 0) for window in windows)
+
+
+@pytest.mark.parametrize(("seconds", "clips"), [(4.9, 0), (5.0, 1), (6.9, 1), (7.0, 2), (3600, 1798)])
+def test_candidates_fit_on_the_timeline(seconds: float, clips: int) -> None:
+    assert count_candidates(seconds, ClipSettings()) == clips
+
+
+def test_videos_too_short_for_a_clip_are_an_error(tmp_path: Path, options: JobOptions) -> None:
+    write_street(tmp_path / "blink.mp4", frames=4)
+    with pytest.raises(ConfigError, match="long enough"):
+        plan_job([tmp_path / "blink.mp4"], options, workers=1)
+
+
+def test_readable_units() -> None:
+    assert [hours(2.5), hours(0.5), hours(0.002)] == ["2.5 h", "30.0 min", "7.2 s"]
+    assert [size(12), size(1.5e6), size(2.5e12)] == ["12 B", "1.5 MB", "2.5 TB"]
