@@ -68,7 +68,7 @@ def plan(
     leave_out: LeaveOut = None,
     as_json: AsJson = False,
 ) -> None:
-    """What labelling would take, before anything is spent: clips, disk and hours, measured on a minute of the footage."""
+    """What labelling would take, before anything is spent: clips, disk and hours, from a minute of the footage."""
     from pipelines.commands import JobOptions
     from pipelines.plan_console import show_plan
 
