@@ -26,8 +26,8 @@ GRIC_OUTLIER = 2.0
 _RUNGS = ((2, 0), (2, 3), (3, 5))
 """Dimension of the manifold and parameters of still, turning, moving."""
 _INLIER = 3.0
+_SIDEWAYS_RAD = 0.7
 _STEPS = 9
-_NO_PRIOR = (np.array([0.0, 0.0, 1.0]), 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,18 +94,19 @@ def explain_pair(
         least_inlier_share: below it, five-point RANSAC and the homography's decomposition propose other starts.
     """
     first, second, weight = corners.first, corners.second, corners.weight
-    scales = _scales(first, second, rotation, noise_floor)
-    turn = fit_turning(first, second, weight, rotation, scales)
+    turn = _turn(corners, rotation, noise_floor)
     prior = (axis, axis_sigma)
-    fit = fit_moving(first, second, weight, rotation, axis, scales, noise_floor, *prior)
-    if _share(first, second, fit, noise_floor) < least_inlier_share:
-        fit = _restarted(corners, fit, turn, axis, scales, noise_floor, prior)
-    rotation, axis, information = fit
+    fit = _moving(corners, [(rotation, axis), (turn, axis)], noise_floor, prior)
+    if _share(corners, fit, noise_floor) < least_inlier_share:
+        starts = [*five_point(first, second, noise_floor), *plane_motions(first, second, noise_floor)]
+        fit = _moving(corners, starts, noise_floor, prior, rival=fit)
+    rotation, axis, information = _without_traffic(corners, fit, noise_floor, prior)
     distance = np.abs(sampson_residuals(first, second, rotation, axis))
     noise = float(np.clip(1.4826 * np.median(distance), noise_floor, 4.0 * noise_floor))
     moving = (distance / noise) ** 2
-    still = ((second - first) ** 2).sum(axis=1) / noise**2
-    turning = (turning_residuals(first, second, turn) ** 2).sum(axis=1) / noise**2
+    # Noise sits on both ends: as for Sampson's distance, half the transfer error belongs to each.
+    still = ((second - first) ** 2).sum(axis=1) / (2.0 * noise**2)
+    turning = (turning_residuals(first, second, turn) ** 2).sum(axis=1) / (2.0 * noise**2)
     along, gain = parallaxes(first, second, rotation, axis).T
     evidence = sign_evidence(along[moving < _INLIER**2], noise)
     moving_cost = np.where(
@@ -147,32 +148,91 @@ def sign_evidence(parallax: np.ndarray, noise: float) -> float:
     return float(square[parallax > 0].sum() - square[parallax < 0].sum())
 
 
-def _scales(first: np.ndarray, second: np.ndarray, rotation: np.ndarray, noise: float) -> np.ndarray:
-    """Robust scales, from one that takes in the median corner under the last turn down to three sigma."""
-    typical = float(np.median(np.abs(turning_residuals(first, second, rotation))))
-    widest = max(15.0 * noise, 2.0 * typical)
+def _turn(corners: Corners, rotation: np.ndarray, noise: float) -> np.ndarray:
+    """The rotation that most corners agree on, from the last one or, should that explain much less, from afar."""
+    first, second, weight = corners.first, corners.second, corners.weight
+    distance = np.linalg.norm(turning_residuals(first, second, rotation), axis=1)
+    widest = max(15.0 * noise, 2.0 * float(np.median(distance)))
+    found, most = rotation, -0.05
+    for start in (15.0 * noise, widest):
+        turn = fit_turning(first, second, weight, rotation, _narrowing(start, noise))
+        near = np.linalg.norm(turning_residuals(first, second, turn), axis=1) < 2.0 * _INLIER * noise
+        share = float((weight * near).mean())
+        if share > most + 0.05:
+            found, most = turn, share
+    return found
+
+
+def _moving(
+    corners: Corners,
+    starts: list[tuple[np.ndarray, np.ndarray]],
+    noise: float,
+    prior: tuple,
+    rival: tuple | None = None,
+) -> tuple:
+    """The fit that explains most corners; a later start must explain clearly more than an earlier one.
+
+    The first start is the last motion, so that traffic takes over only where it outnumbers the scene.
+    """
+    first, second, weight = corners.first, corners.second, corners.weight
+    scales = _narrowing(15.0 * noise, noise)
+    best = rival
+    most = -9.0 if best is None else _merit(corners, best, noise, prior)
+    for rotation, direction in starts:
+        fit = fit_moving(first, second, weight, rotation, direction, scales, noise, *prior)
+        merit = _merit(corners, fit, noise, prior)
+        if best is None or merit > most + 0.05:
+            best, most = fit, merit
+    assert best is not None
+    return best
+
+
+def _without_traffic(corners: Corners, fit: tuple, noise: float, prior: tuple) -> tuple:
+    """The fit again without corners that, had they stood still, would lie behind the camera or below the road."""
+    rotation, direction = fit[0], fit[1]
+    first, second = corners.first, corners.second
+    near = np.abs(sampson_residuals(first, second, rotation, direction)) < _INLIER * noise
+    along, gain = parallaxes(first, second, rotation, direction).T
+    along = along * (1.0 if sign_evidence(along[near], noise) >= 0 else -1.0)
+    wrong = (along < -_INLIER * noise) | _below_road(first, second, rotation, along / gain, noise / gain)
+    if not (wrong & near).any() or wrong.mean() > 0.5:
+        return fit
+    weight = np.where(wrong, 0.0, corners.weight)
+    return fit_moving(first, second, weight, rotation, direction, np.full(4, 3.0 * noise), noise, *prior)
+
+
+def _merit(corners: Corners, fit: tuple, noise: float, prior: tuple) -> float:
+    """Share of the corners that a fit explains, less up to a third where its direction is not one that cars take."""
+    axis, sigma = prior
+    jump = _angle(axis, fit[1]) / (3.0 * sigma + 0.2)
+    return _share(corners, fit, noise) - 0.33 * max(min(1.0, jump**2), sideways(fit[1]))
+
+
+def sideways(axis: np.ndarray) -> float:
+    """0 to 1: how unlike a car with a camera on its windscreen a direction of travel is, forward or backward alike."""
+    return min(1.0, (_angle(np.array([0.0, 0.0, 1.0]), axis) / _SIDEWAYS_RAD) ** 2)
+
+
+def _angle(one: np.ndarray, other: np.ndarray) -> float:
+    """Radians between two lines."""
+    return math.acos(min(1.0, abs(float(one @ other))))
+
+
+def _narrowing(widest: float, noise: float) -> np.ndarray:
+    """Robust scales from the widest down to three sigma."""
     ratio = (3.0 * noise / widest) ** (1.0 / (_STEPS - 3))
     return np.maximum(3.0 * noise, widest * ratio ** np.arange(_STEPS))
 
 
-def _share(first: np.ndarray, second: np.ndarray, fit: tuple, noise: float) -> float:
-    return float((np.abs(sampson_residuals(first, second, fit[0], fit[1])) < _INLIER * noise).mean())
-
-
-def _restarted(
-    corners: Corners, fit: tuple, turn: np.ndarray, axis: np.ndarray, scales: np.ndarray, noise: float, prior: tuple
-) -> tuple:
-    """The best of the fits from other starts; another must explain clearly more corners than the last motion does."""
-    first, second, weight = corners.first, corners.second, corners.weight
-    starts = [(turn, axis), *five_point(first, second, noise), *plane_motions(first, second, noise)]
-    narrow = scales[len(scales) // 2 :]
-    best, best_share = fit, _share(first, second, fit, noise) + 0.05
-    for rotation, direction in starts:
-        other = fit_moving(first, second, weight, rotation, direction, narrow, noise, *prior)
-        share = _share(first, second, other, noise)
-        if share > best_share:
-            best, best_share = other, share
-    return best
+def _share(corners: Corners, fit: tuple, noise: float) -> float:
+    """Weighted share of the corners that obey the epipolar constraint and do not lie below the road."""
+    first, second = corners.first, corners.second
+    rotation, direction = fit[0], fit[1]
+    near = np.abs(sampson_residuals(first, second, rotation, direction)) < _INLIER * noise
+    along, gain = parallaxes(first, second, rotation, direction).T
+    sign = 1.0 if sign_evidence(along[near], noise) >= 0 else -1.0
+    near &= ~_below_road(first, second, rotation, sign * along / gain, noise / gain)
+    return float((corners.weight * near).mean())
 
 
 def five_point(first: np.ndarray, second: np.ndarray, noise: float) -> list[tuple[np.ndarray, np.ndarray]]:

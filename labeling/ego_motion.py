@@ -21,6 +21,7 @@ from labeling.ego_chain import (
     smoothed_steps,
     turns_and_directions,
 )
+from labeling.ego_ladder import sideways
 from labeling.ego_modes import MODES, MOVING, cheapest_path, travel_signs
 from labeling.ego_scale import Depths, corner_depths, pooled_pitch, road_part
 from labeling.ego_settings import EgoSettings
@@ -200,7 +201,8 @@ def _confidence(step: Step | None, state: int) -> float:
     agreement = np.clip((share - 0.35) / 0.35, 0.0, 1.0)
     enough = min(1.0, len(step.corners.ids) / 60.0)
     undisputed = np.clip(1.5 - 1.5 * motion.second_share / max(share, 1e-3), 0.0, 1.0)
-    return float(agreement * enough * undisputed)
+    plausible = 1.0 - (sideways(motion.axis) if state == MOVING else 0.0)
+    return float(agreement * enough * undisputed * plausible)
 
 
 def _on_all_frames(
