@@ -2,6 +2,7 @@
 
 import functools
 import importlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,6 +40,9 @@ COMMAND_STAGES: dict[str, tuple[str, ...]] = {
     "pack": ("pack", "shards"),
 }
 """What a person calls a stage, and what runs for it."""
+
+
+EXTRA_STAGES_VARIABLE = "ANIMATIC_EXTRA_STAGES"
 
 
 class NotReadyError(AnimaticError):
@@ -128,10 +132,17 @@ def load_stage(name: str) -> Stage:
     Raises:
         ConfigError: there is none.
     """
-    if name not in STAGES:
-        raise ConfigError(f"stage {name!r} is not known; choose one of {', '.join(STAGES)}")
-    module, _, attribute = STAGES[name].partition(":")
+    known = {**STAGES, **_extra_stages()}
+    if name not in known:
+        raise ConfigError(f"stage {name!r} is not known; choose one of {', '.join(known)}")
+    module, _, attribute = known[name].partition(":")
     return getattr(importlib.import_module(module), attribute)()
+
+
+def _extra_stages() -> dict[str, str]:
+    """Stages of one's own, ``name=module:Class`` with commas between, which worker processes must find too."""
+    pairs = (entry.partition("=") for entry in os.environ.get(EXTRA_STAGES_VARIABLE, "").split(",") if entry)
+    return {name: place for name, _, place in pairs}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
