@@ -15,7 +15,7 @@ from dataset.conditions import Condition, apply_condition
 from dataset.street_actors import Actor, car_actor_now, ground_shadows, person_actor_now
 from dataset.street_drives import Drive, StreetPath, drive_along, drive_given, path_from_bends, speed_profile, wandering
 from dataset.street_labels import StreetObject, label_actors, label_lanes
-from dataset.street_polygons import Canvas, Polygons, blank_canvas, join, make_polygons
+from dataset.street_polygons import NO_OWNER, Canvas, Polygons, blank_canvas, join, make_polygons
 from dataset.street_raster import paint
 from dataset.street_scene import StillWorld, build_world, facing, plan_street
 from dataset.street_textures import HAZE, SKY_TANGENTS, SKY_TOP, street_atlas, texture_index, texture_size
@@ -34,7 +34,7 @@ SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)
 _HAZE_M = 420.0
 _FAR_M = 260.0
 _SHADOW_M = 90.0
-_ACTORS_M = 130.0
+_CARS_M, _PEOPLE_M = 130.0, 90.0
 _MOST_ACTORS = 250
 
 _Way = TypeVar("_Way", CarActor, PersonActor)
@@ -174,19 +174,22 @@ class Street:
     def _actors(self, i: int, cam_to_street: np.ndarray) -> list[Actor]:
         """Who is near and not wholly behind, from far to near."""
         eye = cam_to_street[:3, 3]
-        found = [car_actor_now(car, i, eye=eye, sun=self._sun) for car in self._near(self._cars, i, 3.0)]
-        found += [person_actor_now(person, i, eye=eye, sun=self._sun) for person in self._near(self._people, i, 1.5)]
+        found = [car_actor_now(car, i, eye=eye, sun=self._sun) for car in self._near(self._cars, i, 3.0, _CARS_M)]
+        found += [
+            person_actor_now(person, i, eye=eye, sun=self._sun)
+            for person in self._near(self._people, i, 1.5, _PEOPLE_M)
+        ]
         found.sort(key=lambda actor: -actor.distance_m)
         return [actor.with_owner(order + 1) for order, actor in enumerate(found[-_MOST_ACTORS:])]
 
-    def _near(self, actors: list[_Way], i: int, radius: float) -> list[_Way]:
+    def _near(self, actors: list[_Way], i: int, radius: float, farthest: float) -> list[_Way]:
         """Those that may reach into the picture; a place of NaN (not there now) never does."""
         if not actors:
             return []
         cam_to_street = self._pose(i)
         middle = np.array([actor.position[i] for actor in actors]) - (0.0, 0.9, 0.0)
         seen = self._in_view(middle, np.full(len(middle), radius), cam_to_street)
-        seen &= np.linalg.norm(middle - cam_to_street[:3, 3], axis=1) < _ACTORS_M
+        seen &= np.linalg.norm(middle - cam_to_street[:3, 3], axis=1) < farthest
         return [actors[index] for index in np.flatnonzero(seen)]
 
     def _paint(self, cam_to_street: np.ndarray, actors: list[Actor]) -> tuple[Canvas, np.ndarray, np.ndarray]:
@@ -211,9 +214,13 @@ class Street:
         standing = []
         for _, kind, index in sorted(order):
             thing = actors[index].polygons if kind else world.things[index]
-            standing.append(thing if kind else thing.take(np.flatnonzero(facing(thing, eye))))
+            standing.append(thing)
         shadows = ground_shadows([actor for actor in actors if actor.distance_m < _SHADOW_M], self._sun)
-        return join([self._sky_at(eye), world.ground.take(np.flatnonzero(near)), shadows, *standing])
+        behind = [self._sky_at(eye), world.ground.take(np.flatnonzero(near)), shadows]
+        if not standing:
+            return join(behind)
+        upright = join(standing)
+        return join([*behind, upright.take(np.flatnonzero((upright.owner != NO_OWNER) | facing(upright, eye)))])
 
     def _in_view(self, middle: np.ndarray, radius: np.ndarray, cam_to_street: np.ndarray) -> np.ndarray:
         """(G,) bool: balls that may reach into the picture."""

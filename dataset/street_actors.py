@@ -70,8 +70,8 @@ def _car_polygons(
     model: CarModel, paint: np.ndarray, braking: bool, placed: np.ndarray, eye: np.ndarray, sun: np.ndarray,
     distance: float,
 ) -> Polygons:  # fmt: skip
-    facing = model.normal @ eye > model.plane + 1e-4
-    facing &= (model.area * (_FOCAL_HINT_PX / max(distance, 1.0)) ** 2 > _SMALL_PX2) | model.painted
+    towards = model.normal @ eye > model.plane + 1e-4
+    facing = towards & ((model.area * (_FOCAL_HINT_PX / max(distance, 1.0)) ** 2 > _SMALL_PX2) | model.painted)
     rank = np.argsort(np.array(model.part_order(eye)))[model.part]
     index = np.flatnonzero(facing)
     index = index[np.argsort(rank[index], kind="stable")]
@@ -85,12 +85,15 @@ def _car_polygons(
     shine = (model.gloss[index] * np.clip(0.25 - 0.75 * normal[:, 1], 0, 1) * 0.55)[:, None]
     lit = np.clip(colour * light[:, None] * (1 - shine) + _SKY_LIGHT * shine, 0, 255)
     corners = model.corners[index] @ placed[:3, :3].T + placed[:3, 3]
-    count = len(index)
+    count, detail = len(index), model.beside[index, 0] < 0
+    # An edge is part of the outline where the face across it looks away; other edges are seams.
+    outline = (~towards[model.beside[index]] * np.array([1, 2, 4])).sum(axis=1)
+    soft = np.where(detail, ALL_SOFT, outline).astype(np.int32)
     return Polygons(
         corners=corners.astype(np.float32), corner_count=model.corner_count[index], colour=lit.astype(np.float32),
         texture=np.full(count, -1, np.int32), gradient=np.zeros((count, 2, 4), np.float32),
         owner=np.zeros(count, np.int32), alpha=np.ones(count, np.float32),
-        grow_px=np.where(model.solid[index], 0.5, 0.3).astype(np.float32), soft=np.full(count, ALL_SOFT, np.int32),
+        grow_px=np.where(detail, 0.3, 0.0).astype(np.float32), soft=soft,
         fog=np.ones(count, np.float32),
     )  # fmt: skip
 

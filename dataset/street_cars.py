@@ -90,8 +90,8 @@ class CarModel:
     """(F,) float32: how much sky it mirrors."""
     area: np.ndarray
     """(F,) float64, square metres."""
-    solid: np.ndarray
-    """(F,) bool: a face of a solid; else a detail that lies on one."""
+    beside: np.ndarray
+    """(F, 3) int32: for the triangles of solids, the face across the edge from each corner; -1 for details."""
     part: np.ndarray
     """(F,) int32: 0 below the body, 1 body, 2 cabin, 3 left mirror, 4 right mirror."""
     solids: tuple[np.ndarray, ...]
@@ -121,8 +121,13 @@ class _Builder:
     def hull(self, points: np.ndarray, part: int, *, colour: tuple | None = None, gloss: float = 0.3) -> np.ndarray:
         """A convex solid; ``colour`` None means the car's paint. Returns its half-spaces (E, 4)."""
         hull = ConvexHull(points)
-        for triangle, equation in zip(hull.simplices, hull.equations, strict=True):
-            self._add(points[triangle], equation[:3], part, colour, gloss, solid=True)
+        first = len(self.corners)
+        for triangle, equation, across in zip(hull.simplices, hull.equations, hull.neighbors, strict=True):
+            # Qhull names the neighbour opposite to each corner; ours lie across the edge from each corner to the next.
+            turned = np.linalg.det([*(points[triangle[1:]] - points[triangle[0]]), equation[:3]]) < 0
+            beside = across[[0, 2, 1]] if turned else across[[2, 0, 1]]
+            corners = points[triangle[::-1] if turned else triangle]
+            self._add(corners, equation[:3], part, colour, gloss, beside=tuple(first + beside))
         return np.unique(np.round(hull.equations, 9), axis=0)
 
     def detail(
@@ -132,12 +137,12 @@ class _Builder:
         """A flat polygon on a part, facing ``towards``."""
         self._add(np.asarray(corners, np.float64), np.asarray(towards, np.float64), part, colour, gloss, brake)
 
-    def _add(self, corners, towards, part, colour, gloss, brake=False, solid=False) -> None:
+    def _add(self, corners, towards, part, colour, gloss, brake=False, beside=(-1, -1, -1)) -> None:
         normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
         if normal @ towards < 0:
             corners, normal = corners[::-1], -normal
         self.corners.append(corners)
-        self.rows.append((normal / np.linalg.norm(normal), part, colour, gloss, brake, solid, _area(corners)))
+        self.rows.append((normal / np.linalg.norm(normal), part, colour, gloss, brake, beside, _area(corners)))
 
 
 def _area(corners: np.ndarray) -> float:
@@ -267,7 +272,8 @@ def _ends(make: _Builder, size: CarSize, body: np.ndarray) -> dict[str, np.ndarr
 
 def _disc(x: float, y: float, radius: float, height: float) -> np.ndarray:
     angle = np.arange(MAX_CORNERS) * 2 * np.pi / MAX_CORNERS
-    return np.stack([x + radius * np.cos(angle), np.full(MAX_CORNERS, y), height + radius * np.sin(angle)], -1)
+    up = np.maximum(height + radius * np.sin(angle), 0.004)
+    return np.stack([x + radius * np.cos(angle), np.full(MAX_CORNERS, y), up], -1)
 
 
 def _sides(make: _Builder, size: CarSize) -> dict[str, np.ndarray]:
@@ -311,7 +317,7 @@ def _mirrors(make: _Builder, size: CarSize) -> dict[str, np.ndarray]:
     half = size.width / 2
     named: dict[str, np.ndarray] = {}
     for part, side, word in ((3, 1, "left"), (4, -1, "right")):
-        x, inner, outer, low = size.screen_base - 0.32, side * (half + 0.01), side * (half + 0.20), size.belt + 0.0
+        x, inner, outer, low = size.screen_base - 0.32, side * half * 0.9, side * (half + 0.20), size.belt + 0.0
         box = [(x + dx, y, z) for y, dz in ((inner, 0.03), (outer, 0.0)) for dx in (-0.05, 0.07)
                for z in (low + dz, low + 0.15 - dz / 2)]  # fmt: skip
         make.solids.append(make.hull(np.array(box), part, gloss=0.3))
@@ -350,14 +356,15 @@ def _finished(make: _Builder, named: dict[str, np.ndarray], size: CarSize) -> Ca
     corners = np.zeros((count, MAX_CORNERS, 3))
     for row, polygon in zip(corners, make.corners, strict=True):
         row[: len(polygon)] = polygon
-    normals, parts, colours, gloss, brake, solid, area = zip(*make.rows, strict=True)
+    normals, parts, colours, gloss, brake, beside, area = zip(*make.rows, strict=True)
     normal = np.array(normals)
     return CarModel(
         corners=corners, corner_count=np.array([len(c) for c in make.corners], np.int32),
         colour=np.array([(255, 255, 255) if c is None else c for c in colours], np.float32),
         painted=np.array([c is None for c in colours]), brake=np.array(brake), normal=normal,
         plane=np.einsum("ij,ij->i", normal, corners[:, 0]), gloss=np.array(gloss, np.float32),
-        part=np.array(parts, np.int32), area=np.array(area), solid=np.array(solid), solids=tuple(make.solids),
+        part=np.array(parts, np.int32), area=np.array(area), beside=np.array(beside, np.int32),
+        solids=tuple(make.solids),
         keypoints=np.array([named[name] for name in keypoint_schema("car24").point_names]), size=size,
     )  # fmt: skip
 

@@ -39,12 +39,16 @@ class StreetPath:
 
     def at(self, arc_m: np.ndarray | float, lateral_m: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """(..., 3) ground points ``lateral_m`` to the right of the line at ``arc_m``, and (...,) headings."""
-        arc = (np.asarray(arc_m, np.float64) - self.start_m) / self.step_m
-        grid = np.arange(len(self.points_xz))
-        x = np.interp(arc, grid, self.points_xz[:, 0])
-        z = np.interp(arc, grid, self.points_xz[:, 1])
-        heading = np.interp(arc, grid, self.heading)
-        height = np.interp(arc, grid, self.elevation)
+        last = len(self.points_xz) - 1
+        place = np.clip((np.asarray(arc_m, np.float64) - self.start_m) / self.step_m, 0, last)
+        before = np.minimum(place.astype(np.int64), last - 1)
+        share = place - before
+
+        def between(values: np.ndarray) -> np.ndarray:
+            return values[before] * (1 - share) + values[before + 1] * share
+
+        x, z = between(self.points_xz[:, 0]), between(self.points_xz[:, 1])
+        heading, height = between(self.heading), between(self.elevation)
         out = np.stack(
             np.broadcast_arrays(x + lateral_m * np.cos(heading), -height, z - lateral_m * np.sin(heading)), -1
         )

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numba
 import numpy as np
 
@@ -87,15 +86,30 @@ def label_actors(
 
 def owner_boxes(owner: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """(count,) pixels per owner and (count, 4) float32 boxes around them, over outer edges of pixels."""
-    pixels = np.bincount(owner.ravel(), minlength=count)
-    boxes = np.zeros((count, 4), np.float32)
-    for index in np.flatnonzero(pixels[:count]):
-        if index == 0:
-            continue
-        mask = cv2.inRange(owner, int(index), int(index))  # type: ignore[call-overload]
-        x, y, w, h = cv2.boundingRect(mask)
-        boxes[index] = (x - 0.5, y - 0.5, x + w - 0.5, y + h - 0.5)
-    return pixels, boxes
+    pixels, extents = _owner_extents(owner, count)
+    return pixels, (extents + (-0.5, -0.5, 0.5, 0.5)).astype(np.float32)
+
+
+@numba.njit(cache=True)
+def _owner_extents(owner, count):
+    height, width = owner.shape
+    pixels = np.zeros(count, np.int64)
+    extents = np.zeros((count, 4), np.int64)
+    for y in range(height):
+        line = owner[y]
+        x = 0
+        while x < width:
+            start, who = x, line[x]
+            while x < width and line[x] == who:
+                x += 1
+            if who > 0:
+                if pixels[who] == 0:
+                    extents[who, 0], extents[who, 1] = start, y
+                pixels[who] += x - start
+                extents[who, 0] = min(extents[who, 0], start)
+                extents[who, 2] = max(extents[who, 2], x - 1)
+                extents[who, 3] = y
+    return pixels, extents
 
 
 def _unhidden(pixels: np.ndarray, z: np.ndarray, owner: int, canvas: Canvas) -> np.ndarray:

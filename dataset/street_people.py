@@ -83,7 +83,7 @@ def joints_at(look: PersonLook, *, walked_m: float, speed_mps: float) -> np.ndar
                             ("wrist", wrist), ("eye", eye), ("ear", ear)):  # fmt: skip
             points[_INDEX[f"{word}_{name}"]] = point
     points[_INDEX["nose"]] = (0.062 * h, 0.0, 0.915 * h + bob)
-    points[:, 2] -= max(0.0, points[[15, 16], 2].min() - 0.045 * h)
+    points[:, 2] -= max(0.0, points[[15, 16], 2].min() - 0.056 * h)
     return points
 
 
@@ -212,10 +212,20 @@ def person_polygons(
     return Polygons(
         corners=placed.astype(np.float32), corner_count=number, colour=lit, texture=np.full(total, -1, np.int32),
         gradient=np.zeros((total, 2, 4), np.float32), owner=np.full(total, owner, np.int32),
-        alpha=np.ones(total, np.float32), grow_px=np.full(total, 0.4, np.float32),
-        soft=np.full(total, ALL_SOFT, np.int32),
+        alpha=np.ones(total, np.float32), grow_px=np.zeros(total, np.float32), soft=_outline(outward, count),
         fog=np.ones(total, np.float32),
     ).take(np.flatnonzero(outward))  # fmt: skip
+
+
+def _outline(outward: np.ndarray, prisms: int) -> np.ndarray:
+    """Soft edges (bit masks) of prism faces: those whose neighbour looks away; all of the details that follow."""
+    seen = outward[: prisms * (_RING + 2)].reshape(prisms, _RING + 2)
+    away, low, high = ~seen[:, :_RING], ~seen[:, _RING], ~seen[:, _RING + 1]
+    soft = np.empty((prisms, _RING + 2), np.int32)
+    soft[:, :_RING] = low[:, None] + 2 * np.roll(away, -1, axis=1) + 4 * high[:, None] + 8 * np.roll(away, 1, axis=1)
+    soft[:, _RING] = (away[:, (_RING - 2 - np.arange(_RING)) % _RING] << np.arange(_RING)).sum(axis=1)
+    soft[:, _RING + 1] = (away << np.arange(_RING)).sum(axis=1)
+    return np.concatenate([soft.ravel(), np.full(len(outward) - soft.size, ALL_SOFT, np.int32)])
 
 
 def _face(look: PersonLook, points: np.ndarray) -> np.ndarray:

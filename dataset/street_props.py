@@ -13,11 +13,16 @@ def sunlight(normal: np.ndarray, sun: np.ndarray) -> float:
 
 
 def wall_polygon(
-    foot: np.ndarray, along: np.ndarray, *, width: float, bottom: float, top: float, name: TextureName,
-    tint: np.ndarray, shift_m: float = 0.0,
+    foot: np.ndarray, along: np.ndarray, *, outward: np.ndarray, width: float, bottom: float, top: float,
+    name: TextureName, tint: np.ndarray, shift_m: float = 0.0,
 ) -> Polygons:  # fmt: skip
-    """An upright textured rectangle from ``foot`` (3,) along the unit vector ``along`` (3,); heights above the foot."""
+    """An upright textured rectangle from ``foot`` (3,) along the unit vector ``along`` (3,); heights above the foot.
+
+    It is wound so that it is seen from the side that ``outward`` (3,) points to.
+    """
     up = np.array([0.0, -1.0, 0.0])
+    if np.cross(along, up) @ outward < 0:
+        foot, along = foot + along * width, -along
     corners = np.array([
         foot + up * bottom, foot + along * width + up * bottom, foot + along * width + up * top, foot + up * top
     ])  # fmt: skip
@@ -34,7 +39,8 @@ def frontal_wall(path: StreetPath) -> Polygons:
     """A wide brick wall across the road, 14 m ahead of the camera's start."""
     spot, heading = path.at(14.0)
     right = np.array([np.cos(heading), 0.0, -np.sin(heading)])
-    common = {"width": 240.0, "tint": np.full(3, 245.0)}
+    ahead = np.array([np.sin(heading), 0.0, np.cos(heading)])
+    common = {"width": 240.0, "tint": np.full(3, 245.0), "outward": -ahead}
     foot = spot - right * 120
     return join([
         wall_polygon(foot, right, bottom=3.6, top=30.0, name="brick", **common),
@@ -103,7 +109,7 @@ def _blob(centre: np.ndarray, radius: float, rng: np.random.Generator, sun: np.n
     gradient[:, 0, :3], gradient[:, 1, :3] = across * per_m, np.cross(normal, across) * per_m
     gradient[:, :, 3] = -np.einsum("nij,j->ni", gradient[:, :, :3], centre) + rng.uniform(0, 256, (1, 2))
     return make_polygons(
-        faces, colour=green * shade[:, None], texture=texture_index("leaves"), gradient=gradient, grow_px=0.4
+        faces, colour=green * shade[:, None], texture=texture_index("leaves"), gradient=gradient, soft=0
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dataset.street_drives import StreetPath
-from dataset.street_polygons import ALL_SOFT, NO_TEXTURE, Polygons, join, make_polygons
+from dataset.street_polygons import ALL_SOFT, Polygons, join, make_polygons
 from dataset.street_props import column, frontal_wall, lamp_post, sunlight, tree, wall_polygon
 from dataset.street_textures import FACADES, GROUND_FLOORS, TEXTURE_METRES, TextureName, texture_index, texture_size
 
@@ -239,16 +239,32 @@ def _building(
     for start, direction in ((foot, -forward), (foot + forward * width, forward)):
         parts.append(
             wall_polygon(
-                start, right * side, width=depth, bottom=0, top=top, name="wall", tint=tint * sunlight(direction, sun)
+                start,
+                right * side,
+                outward=direction,
+                width=depth,
+                bottom=0,
+                top=top,
+                name="wall",
+                tint=tint * sunlight(direction, sun),
             )
         )
-    common = {"tint": front, "shift_m": shift}
+    common = {"tint": front, "shift_m": shift, "outward": -side * right}
     parts.append(wall_polygon(foot, forward, width=width, bottom=ground_m, top=top, name=name, **common))
     parts.append(wall_polygon(foot, forward, width=width, bottom=0, top=ground_m, name=below, **common))
     ledge = foot - right * side * 0.05
     for bottom, high, share in ((ground_m - 0.12, ground_m + 0.12, 0.8), (top - 0.05, top + 0.45, 0.7)):
         parts.append(
-            wall_polygon(ledge, forward, width=width, bottom=bottom, top=high, name="wall", tint=front * share)
+            wall_polygon(
+                ledge,
+                forward,
+                outward=-side * right,
+                width=width,
+                bottom=bottom,
+                top=high,
+                name="wall",
+                tint=front * share,
+            )
         )
     return join(parts)
 
@@ -305,7 +321,10 @@ def _furniture(path: StreetPath, plan: StreetPlan, rng: np.random.Generator, sun
 
 
 def facing(polygons: Polygons, eye: np.ndarray) -> np.ndarray:
-    """(N,) bool: rectangles with a texture (walls) always; other faces only where they turn towards ``eye``."""
-    a, b, c = polygons.corners[:, 0], polygons.corners[:, 1], polygons.corners[:, 2]
-    wall = (polygons.texture != NO_TEXTURE) & (polygons.corner_count == 4)
-    return wall | (np.einsum("ij,ij->i", np.cross(b - a, c - a), a - eye) < 0)
+    """(N,) bool: faces that turn towards ``eye``."""
+    a = polygons.corners[:, 0]
+    ab, ac, back = polygons.corners[:, 1] - a, polygons.corners[:, 2] - a, a - eye.astype(np.float32)
+    normal_x = ab[:, 1] * ac[:, 2] - ab[:, 2] * ac[:, 1]
+    normal_y = ab[:, 2] * ac[:, 0] - ab[:, 0] * ac[:, 2]
+    normal_z = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
+    return normal_x * back[:, 0] + normal_y * back[:, 1] + normal_z * back[:, 2] < 0
