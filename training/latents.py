@@ -5,7 +5,6 @@ Skeletons are rasterised afresh from keypoints and object and ego videos from tr
 comes from the same keypoints. A clip is done when its line is in the part's log; a killed job goes on from there.
 """
 
-import json
 import os
 import shutil
 import tempfile
@@ -324,8 +323,3 @@ def manifest_picture(store: LatentStore) -> PictureConfig:
         return PictureConfig.model_validate(store.manifest.backbone["picture"] | {"frames": store.manifest.frames})
     except (KeyError, ValueError) as error:
         raise ConfigError(f"{store.folder / MANIFEST} names no picture ({error}); cache again") from error
-
-
-def to_json(summary: CacheSummary) -> str:
-    """The summary as one line of JSON."""
-    return json.dumps({**asdict(summary), "folder": str(summary.folder)}, sort_keys=True)
