@@ -1,0 +1,264 @@
+"""The command line: what a person types, and the one line that they get back for what they can mend."""
+
+import json
+import re
+import subprocess
+import sys
+
+import cv2
+import pytest
+import yaml
+from pipeline_fixtures import SMALL, write_detector, write_street
+
+from pipelines.cli import main
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    return write_street(tmp_path_factory.mktemp("v") / "street.mp4", frames=24)
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    path = tmp_path_factory.mktemp("c") / "small.yaml"
+    path.write_text(yaml.safe_dump(SMALL))
+    return path
+
+
+@pytest.fixture(autouse=True)
+def no_weights(tmp_path_factory, monkeypatch):
+    """No weights but the shipped ones, whatever this machine has."""
+    monkeypatch.setenv("ANIMATIC_MODELS", str(tmp_path_factory.mktemp("none")))
+
+
+def animatic(monkeypatch, capsys, *arguments):
+    """Exit code, standard output and standard error of a command."""
+    monkeypatch.setattr(sys, "argv", ["animatic", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    code = end.value.code
+    out = capsys.readouterr()
+    return (0 if code is None else code), out.out, out.err
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    return lambda *arguments: animatic(monkeypatch, capsys, *arguments)
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory, video, config):
+    root = tmp_path_factory.mktemp("j") / "J"
+    command = [sys.executable, "-c", "from pipelines.cli import main; main()", "label", str(video), "--out", str(root)]
+    done = subprocess.run(
+        [*command, "--config", str(config), "--keep-share", "1", "--workers", "0"], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "pack 1 done" in done.stdout
+    return root
+
+
+def test_help_names_every_command_and_loads_nothing_heavy():
+    code = (
+        "import sys; import pipelines.cli as c\n"
+        "names = {i.name or i.callback.__name__ for i in c.app.registered_commands}\n"
+        "names |= {g.name for g in c.app.registered_groups}\n"
+        "heavy = {'numpy', 'cv2', 'torch', 'pydantic', 'pyarrow'}\n"
+        "print(sorted(names)); print(sorted(heavy & set(sys.modules)))"
+    )
+    names, heavy = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.splitlines()
+    for command in (
+        "label", "index", "count", "select", "cut", "keypoints", "ego", "render", "pack", "slice", "status", "inspect",
+        "cache", "train", "generate", "models", "demo", "export", "chart", "stability", "report", "plan",
+    ):  # fmt: skip
+        assert f"'{command}'" in names, command
+    assert heavy == "[]"
+
+
+def test_status_of_a_finished_job(run, job):
+    code, out, _ = run("status", job)
+    assert code == 0 and f"next: animatic inspect {job}" in out
+    code, out, _ = run("status", job, "--json")
+    stages = {stage["stage"]: stage for stage in json.loads(out)["stages"]}
+    assert stages["cut"]["done"] == 1 and stages["render"]["done"] == 2 and not stages["pack"]["failed"]
+
+
+def test_a_finished_job_is_labelled_again_at_once(run, job):
+    code, out, _ = run("label", "--out", job, "--workers", "0")
+    assert code == 0 and not re.search(r"[1-9]\d* done", out)
+
+
+def test_inspect_gives_a_summary_a_record_and_a_sheet(run, job, tmp_path):
+    code, out, _ = run("inspect", job)
+    assert code == 0 and "kept 2 (every clip), packed 2" in out
+    code, out, _ = run("inspect", job, "street_8", "--json", "--sheet", tmp_path / "s.png")
+    record = json.loads(out)
+    assert (code, record["key"], record["start"]) == (0, "street_8", 8)
+    assert record["caption"] and record["members"]["rgb.mp4"] > 0
+    assert cv2.imread(str(tmp_path / "s.png")).shape[1] > 2000
+    assert json.loads(run("inspect", job, "--json")[1])["packed"] == {"train": 2, "val": 0}
+
+
+def test_a_clip_that_is_not_there_is_named(run, job, tmp_path):
+    code, _, err = run("inspect", job, "street_9")
+    assert code == 2 and "has no clip 'street_9'" in err and err.count("\n") == 1
+    assert run("inspect", job, "--sheet", tmp_path / "s.png")[0] == 2
+    assert run("inspect", job, "street_0", "--sheet", tmp_path / "none" / "s.png")[0] == 2
+
+
+def test_the_released_trainer_s_manifest(run, job, tmp_path):
+    code, _, _ = run("export", "released", job, "--out", tmp_path)
+    lines = [json.loads(line) for line in (tmp_path / "train.jsonl").read_text().splitlines()]
+    assert code == 0 and [line["id"] for line in lines] == ["street_0", "street_8"]
+    from labeling.video import frame_count
+
+    assert all(set(line) == {"id", "caption", "rgb_path", "pose_path"} for line in lines)
+    assert {frame_count(line[name]) for line in lines for name in ("rgb_path", "pose_path")} == {9}
+    assert run("export", "released", job, "--out", tmp_path, "--split", "val")[0] == 2
+
+
+def test_the_report_stands_alone(run, job):
+    code, out, _ = run("report", job)
+    page = (job / "report.html").read_text()
+    assert code == 0 and out.strip() == str(job / "report.html")
+    assert "data:video/mp4;base64," in page and "data:image/" in page
+    assert not re.search(r'(src|href)="(?!data:)', page)
+
+
+def test_models_are_listed_with_how_to_get_them(run, tmp_path):
+    write_detector(tmp_path / "m")
+    code, out, _ = run("models", "--models", tmp_path / "m")
+    assert code == 0 and "counter" in out and "yolox_l" in out and "absent" in out
+    cards = json.loads(run("models", "--models", tmp_path / "m", "--json")[1])["cards"]
+    assert cards["counter"]["state"] == "present" and cards["yolox_nano"]["state"] == "absent"
+
+
+def test_stages_are_commands_of_their_own(run, video, config, tmp_path):
+    root = tmp_path / "J"
+    code, _, err = run("cut", "--out", root)
+    assert code == 2 and "holds no job.yaml" in err
+    code, _, _ = run("index", video, "--out", root, "--config", config, "--keep-share", "1", "--workers", "0")
+    assert code == 0
+    code, _, err = run("cut", "--out", root, "--workers", "0")
+    assert code == 2 and "animatic select" in err
+    for stage in ("count", "select", "cut", "keypoints", "ego", "render", "pack"):
+        options = () if stage == "select" else ("--workers", "0")
+        assert run(stage, "--out", root, *options)[0] == 0, stage
+    assert (root / "shards" / "index.parquet").is_file()
+    assert run("select", "--out", root, "--extend")[0] == 0
+    assert run("select", "--out", root, "--refreeze")[0] == 0
+    assert run("select", "--out", root, "--refreeze", "--extend")[0] == 2
+
+
+def test_slice_is_index_and_cut(run, video, config, tmp_path):
+    code, _, _ = run("slice", video, "--out", tmp_path / "J", "--config", config, "--workers", "0")
+    assert code == 0
+    assert sorted(path.name for path in (tmp_path / "J/videos/street").iterdir()) == [
+        "index.parquet", "run_0_17.frames.parquet", "run_0_17.mp4"
+    ]  # fmt: skip
+    code, out, _ = run("status", tmp_path / "J")
+    assert code == 0 and "next: animatic label --out" in out
+
+
+def test_one_bad_video_ends_with_exit_code_1_and_its_reason(run, video, config, tmp_path):
+    (tmp_path / "v").mkdir()
+    (tmp_path / "v" / "good.mp4").write_bytes(video.read_bytes())
+    (tmp_path / "v" / "bad.mp4").write_text("no video at all")
+    root = tmp_path / "J"
+    code, out, _ = run(
+        "label", tmp_path / "v", "--out", root, "--config", config, "--keep-share", "1", "--workers", "0"
+    )
+    assert code == 1 and "bad.mp4" in out and "pack 1 done" in out
+    code, out, _ = run("status", root)
+    assert code == 1 and "1 video" in out and "bad.mp4" in out
+    # It stays bad until it changes, and says so again.
+    code, out, _ = run("label", "--out", root, "--workers", "0")
+    assert code == 1 and "bad.mp4" in out
+
+
+def test_a_job_of_which_nothing_is_left_says_why(run, config, tmp_path):
+    short = write_street(tmp_path / "short.mp4", frames=5)
+    code, out, _ = run(
+        "label", short, "--out", tmp_path / "J", "--config", config, "--keep-share", "1", "--workers", "0"
+    )
+    assert code == 1 and "no clip is left: too_short: frames=5 < clip_frames=9" in out
+
+
+def bad_yaml(tmp_path, text):
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda t, v: ["none.mp4", "-o", t / "J"], "no such file; check the path"),
+        (lambda t, v: [t, "-o", t / "J"], "holds no videos"),
+        (lambda t, v: ["-o", t / "J"], "no videos were given"),
+        (lambda t, v: [copied(v, t / "a.b.mp4"), "-o", t / "J"], "'a.b' is no video id"),
+        (lambda t, v: [v, copied(v, t / "street.mp4"), "-o", t / "J"], "two videos would be called 'street'"),
+        (lambda t, v: [v, "-o", t / "J", "--config", bad_yaml(t, "clip: {frames: 3}")], "clip.frames is not a setting"),
+        (lambda t, v: [v, "-o", t / "J", "--config", bad_yaml(t, "clip: [")], "is no YAML"),
+        (lambda t, v: [v, "-o", t / "J", "--config", bad_yaml(t, "- 1")], "needs a mapping"),
+        (lambda t, v: [v, "-o", t / "J", "--config", bad_yaml(t, "encoder: {gop: 7}")], "must divide"),
+        (lambda t, v: [v, "-o", t / "J", "--keep-share", "0"], "select.keep_share"),
+        (lambda t, v: [v, "-o", t / "J", "--effort", "huge"], "choose one of fast, balanced, exact"),
+        (lambda t, v: [v, "-o", t / "J", "--keep-share", "1", "--part", "3/2"], "give i/n"),
+        (lambda t, v: [v, "-o", t / "J"], "--models DIR"),
+        (lambda t, v: [v, "-o", t / "J", "--models", t / "none"], "is no folder"),
+        (lambda t, v: [v, "-o", t / "J", "--extractors", "nope"], "no model card is called 'nope'"),
+        (lambda t, v: [v, "-o", t / "J", "--extractors", "yolox_l"], "its weights yolox_l.onnx are not there"),
+        (lambda t, v: [v, "-o", t / "J", "--models", spoilt(t, b"<html>not found</html>")], "counter.onnx"),
+        (lambda t, v: [v, "-o", t / "J", "--models", spoilt(t, None)], "sha256"),
+        (lambda t, v: [v, "-o", in_the_way(t) / "J", "--keep-share", "1"], "give a folder that can be written to"),
+        (lambda t, v: [v, "-o", t / "J", "--leave-out", bad_yaml(t, "video_id,start_s\nx,1")], "has no column"),
+        (lambda t, v: [v, "-o", t / "J", "--leave-out", bad_yaml(t, "video_id,start_s,end_s\nx,1,1")], "names 'x'"),
+    ],
+    ids=[
+        "missing", "empty folder", "nothing", "dot", "same id", "unknown key", "broken YAML", "list", "GOP", "share",
+        "effort", "part", "no detector", "no models", "no card", "no weights", "HTML", "hash", "unwritable", "column",
+        "unknown video",
+    ],
+)  # fmt: skip
+def test_what_can_be_mended_is_one_line_and_exit_code_2(run, video, tmp_path, make, message):
+    code, out, err = run("label", *make(tmp_path, video), "--workers", "0")
+    assert code == 2
+    assert message in err and "Traceback" not in out + err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "J" / "videos").exists()
+
+
+def copied(video, path):
+    path.write_bytes(video.read_bytes())
+    return path
+
+
+def spoilt(folder, content):
+    """A models folder whose card's file holds something else; None: other bytes of the same kind."""
+    models = write_detector(folder / "m")
+    path = models / "counter.onnx"
+    if content is None:
+        path.write_bytes(path.read_bytes() + b"\x00")
+    else:
+        path.write_bytes(content)
+    return models
+
+
+def in_the_way(folder):
+    (folder / "file").write_text("a file, not a folder")
+    return folder / "file"
+
+
+def test_a_list_of_paths_with_ids(run, video, config, tmp_path):
+    listed = tmp_path / "videos.txt"
+    listed.write_text(f"# two of them\nmine\t{video}\n\n{video}\n")
+    table = tmp_path / "leave.csv"
+    table.write_text("video_id,start_s,end_s\nmine,0.2,\n")
+    code, _, _ = run(
+        "label", listed, "-o", tmp_path / "J", "--config", config, "--keep-share", "1", "--workers", "0",
+        "--leave-out", table,
+    )  # fmt: skip
+    assert code == 0
+    summary = json.loads(run("inspect", tmp_path / "J", "--json")[1])
+    assert (summary["videos"], summary["kept"], summary["dropped"]) == (2, 3, {"left_out": 1})
