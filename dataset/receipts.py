@@ -250,7 +250,7 @@ def atomic_write(path: Path, data: bytes) -> None:
     """
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        temporary = path.with_name(f".{path.name}.{host_name()}-{os.getpid()}.tmp")
         try:
             with temporary.open("wb") as stream:
                 stream.write(data)

@@ -194,9 +194,14 @@ def keypoints_table(labels: Sequence[Keypoints]) -> pa.Table:
     return pa.Table.from_arrays(columns, schema=KEYPOINTS_SCHEMA)
 
 
-def read_keypoints(path: Path) -> list[Keypoints]:
-    """A run's labels, in the order they were written."""
-    return keypoints_from_table(read_table(path, KEYPOINTS_SCHEMA)[0])
+def read_keypoints(path: Path, *, start: int | None = None, end: int | None = None) -> list[Keypoints]:
+    """A run's labels, in the order they were written; only those of frames ``[start, end)`` where given."""
+    table, _ = read_table(path, KEYPOINTS_SCHEMA)
+    if start is not None or end is not None:
+        frames = _column(table, "frame")
+        inside = (frames >= (-np.inf if start is None else start)) & (frames < (np.inf if end is None else end))
+        table = table.filter(pa.array(inside))
+    return keypoints_from_table(table)
 
 
 def keypoints_from_table(table: pa.Table, *, frame_offset: int = 0) -> list[Keypoints]:

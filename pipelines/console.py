@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from dataset.receipts import Receipt, reason_counts
@@ -33,18 +33,20 @@ class ConsoleReporter:
         if items == 0 or not self.console.is_terminal:
             return
         self._progress = Progress(
-            TextColumn("{task.description:>10}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn(),
+            TextColumn("{task.description:>10}"), BarColumn(bar_width=30),
+            TextColumn("{task.fields[done]}/{task.fields[of]}"), TimeRemainingColumn(),
             console=self.console, transient=True,
         )  # fmt: skip
         self._progress.start()
-        self._task = self._progress.add_task(stage, total=items)
+        self._task = self._progress.add_task(stage, total=weight, done=0, of=items)
 
     def item_finished(self, receipt: Receipt, *, weight: float) -> None:
         """Move the bar; a failure is shown at once."""
         if receipt.state == "failed":
             self.console.print(f"[red]{receipt.stage:>10}[/] {receipt.item}: {escape(receipt.message)}")
         if self._progress is not None and self._task is not None:
-            self._progress.advance(self._task)
+            done = self._progress.tasks[0].fields["done"] + 1
+            self._progress.update(self._task, advance=weight, done=done)
 
     def stage_finished(self, report: StageReport) -> None:
         """One line that says what came of it."""

@@ -31,6 +31,7 @@ from labeling.errors import AnimaticError, StorageError
 from pipelines.stage import DroppedError, WorkItem, load_stage
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_LEAST_FREE_BYTES = 1 << 20
 _DEATHS_ALLOWED = 2
 """A worker that dies is often just the one the system chose to kill; an item that kills two is at fault."""
 
@@ -180,14 +181,14 @@ class Engine:
             for worker in _ready(busy):
                 receipt = self._collect(worker, waiting, deaths)
                 if receipt is not None:
-                    stopped = stopped or _disk_full(receipt)
+                    stopped = stopped or _disk_full(receipt, self._root)
                     yield receipt
 
     def _run_here(self, tasks: Sequence[Task]) -> Iterator[Receipt]:
         for task in tasks:
             receipt = perform(self._root, task, ReceiptLog(self._root, task.item.stage, worker=self._name))
             yield receipt
-            if _disk_full(receipt):
+            if _disk_full(receipt, self._root):
                 return
 
     def _hand_out(self, waiting: deque[Task]) -> None:
@@ -226,8 +227,11 @@ class Engine:
         return receipt
 
 
-def _disk_full(receipt: Receipt) -> bool:
-    return receipt.state == "failed" and receipt.reason == StorageError.reason and "no space left" in receipt.message
+def _disk_full(receipt: Receipt, root: Path) -> bool:
+    """Whether an item failed for want of space for all, rather than for its own sake (as a limit on file sizes)."""
+    if receipt.state != "failed" or receipt.reason != StorageError.reason:
+        return False
+    return "no space left" in receipt.message.lower() or shutil.disk_usage(root).free < _LEAST_FREE_BYTES
 
 
 def _ready(busy: Sequence["_Worker"]) -> list["_Worker"]:

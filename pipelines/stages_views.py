@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dataset.receipts import Output, Receipt
+from dataset.receipts import Output
 from dataset.selection import ClipRow
 from dataset.tables import EgoTable, read_ego, read_frames_table, read_keypoints
 from labeling.camera import Trajectory
@@ -178,16 +178,11 @@ def by_frame(labels: list[Keypoints], run: Span) -> list[list[Keypoints]]:
 
 def clip_labels(root: Path, video_id: str, run: Span, clip: Span) -> list[Keypoints]:
     """A run's labels inside a clip; frames stay those of the video's grid."""
-    labels = read_keypoints(root / run_path(video_id, run, ".keypoints.parquet"))
-    return [label for label in labels if clip.start <= label.frame < clip.end]
+    path = root / run_path(video_id, run, ".keypoints.parquet")
+    return read_keypoints(path, start=clip.start, end=clip.end)
 
 
 def clip_trajectory(ego: EgoTable, clip: Span) -> Trajectory:
     """A run's trajectory inside a clip, in the clip's first camera."""
     first = clip.start - int(ego.frame[0])
     return ego.trajectory.slice(first, first + len(clip))
-
-
-def receipt_files(receipt: Receipt) -> dict[str, str]:
-    """Paths and hashes of what a receipt vouches for."""
-    return {output.path: output.sha256 for output in receipt.outputs}

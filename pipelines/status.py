@@ -120,7 +120,12 @@ def print_status(root: Path, *, as_json: bool = False) -> int:
     if as_json:
         print(json.dumps(asdict(status), indent=1))
         return int(failed)
-    table = Table(title=f"{root}: {status.videos} videos", title_justify="left", box=None, pad_edge=False)
+    table = Table(
+        title=f"{root}: {status.videos} video{'s' * (status.videos != 1)}",
+        title_justify="left",
+        box=None,
+        pad_edge=False,
+    )
     table.add_column("stage", style="bold")
     for column in ("items", "done", "to do"):
         table.add_column(column, justify="right")
