@@ -6,7 +6,8 @@ from diffusers.pipelines.ltx.pipeline_ltx_condition import LTXConditionPipeline
 from training_fixtures import one_thread, tiny_config, tiny_job  # noqa: F401
 
 from labeling.errors import ConfigError, DataError
-from training.backbone import LatentGeometry, SamplingSettings, StageInputs, TextEmbedding, load_backbone
+from training.backbone import LatentGeometry, SamplingSettings, StageInputs, TextEmbedding
+from training.backbones import load_backbone
 from training.batches import TrainingItems
 from training.conditioning import (
     assemble_tokens,

@@ -12,7 +12,8 @@ from labeling.camera import rotation_angle_deg, write_tum
 from labeling.errors import ConfigError, DataError, ModelError
 from labeling.skeleton_video import draw_skeletons
 from labeling.video import frame_count, read_frames
-from training.backbone import SamplingSettings, load_backbone
+from training.backbone import SamplingSettings
+from training.backbones import load_backbone
 from training.clip_views import clip_trajectory
 from training.config import Stage, backbone_config
 from training.ego_recipes import recipe_trajectory

@@ -22,7 +22,7 @@ from training_fixtures import (  # noqa: F401
 from labeling.errors import ConfigError, DataError
 from labeling.skeleton_video import draw_skeletons
 from training import latents as module
-from training.backbone import load_backbone
+from training.backbones import load_backbone
 from training.config import backbone_config
 from training.latent_store import LatentStore
 from training.latents import cache_latents, check_store, open_store

@@ -10,7 +10,8 @@ from training_fixtures import FakeSample, fake_datasets, one_thread  # noqa: F40
 
 from labeling.errors import ModelError
 from training.adapters import activate_adapter
-from training.backbone import Reference, SamplingSettings, StageInputs, load_backbone
+from training.backbone import Reference, SamplingSettings, StageInputs
+from training.backbones import load_backbone
 from training.batches import TrainingItems
 from training.config import backbone_config, load_config
 from training.dry_run import plan_run

@@ -12,7 +12,7 @@ from training_fixtures import PICTURE, in_children, one_thread, tiny_config, tin
 
 from labeling.errors import ConfigError, DataError
 from training.adapters import activate_adapter
-from training.backbone import load_backbone
+from training.backbones import load_backbone
 from training.batches import StepBatches, TrainingItems, collate
 from training.checkpoints import list_checkpoints, newest_checkpoint, save_checkpoint
 from training.config import TrainConfig

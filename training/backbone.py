@@ -230,24 +230,3 @@ def with_empty_text(inputs: StageInputs, empty_text: TextEmbedding) -> StageInpu
         text_mask_BL=torch.cat([empty_mask.to(inputs.text_mask_BL.device), inputs.text_mask_BL]), fps=inputs.fps,
         image_B1D=None if inputs.image_B1D is None else inputs.image_B1D.repeat(2, 1, 1),
     )  # fmt: skip
-
-
-def load_backbone(config: BackboneConfig, *, device: str | torch.device = "cpu", parts: Sequence[str] = ()) -> Backbone:
-    """The backbone that ``config`` names.
-
-    Args:
-        config: what to load and from where.
-        device: where its networks go.
-        parts: of ``denoiser``, ``vae``, ``text``; empty means all. A part that was left out loads when first used.
-
-    Raises:
-        ModelError: weights that are absent or do not fit.
-    """
-    # A backbone's libraries take seconds to import; only the one that is asked for is.
-    if config.kind in ("svd", "tiny_svd"):
-        from training.svd import load_svd
-
-        return load_svd(config, device=device, parts=parts)
-    from training.ltx import load_ltx
-
-    return load_ltx(config, device=device, parts=parts)

@@ -18,7 +18,8 @@ from labeling.camera import Intrinsics, Trajectory
 from labeling.encoding import VideoWriter, lossless_rgb
 from labeling.errors import ConfigError
 from training.adapters import AdapterFile, activate_adapter, read_adapter
-from training.backbone import Backbone, SamplingSettings, TextEmbedding, load_backbone
+from training.backbone import Backbone, SamplingSettings, TextEmbedding
+from training.backbones import load_backbone
 from training.config import BackboneConfig, PictureConfig, Stage, backbone_config
 from training.draws import keyed_normal, keyed_seed
 from training.sampling_inputs import (

@@ -20,7 +20,8 @@ from dataset.receipts import digest, hashed_share, storage_errors, sync_folder
 from labeling.camera import Intrinsics
 from labeling.errors import ConfigError, DataError
 from labeling.skeleton_video import DEFAULT_STYLE
-from training.backbone import Backbone, load_backbone
+from training.backbone import Backbone
+from training.backbones import load_backbone
 from training.clip_views import ClipSample, ClipViews, frame_indices
 from training.config import BackboneConfig, PictureConfig, backbone_config
 from training.latent_store import (

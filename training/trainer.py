@@ -20,7 +20,8 @@ from torchdata.stateful_dataloader import StatefulDataLoader
 from dataset.receipts import storage_errors
 from labeling.errors import ConfigError, DataError
 from training.adapters import trainable_count
-from training.backbone import Backbone, load_backbone
+from training.backbone import Backbone
+from training.backbones import load_backbone
 from training.batches import StepBatches, TrainingBatch, TrainingItems, collate
 from training.checkpoints import check_checkpoint, newest_checkpoint, save_checkpoint
 from training.config import TrainConfig

@@ -24,7 +24,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 from training_fixtures import cached_job, tiny_config  # noqa: E402
 
 from training import tiny  # noqa: E402
-from training.backbone import load_backbone  # noqa: E402
+from training.backbones import load_backbone  # noqa: E402
 from training.batches import StepBatches, TrainingItems, collate  # noqa: E402
 from training.config import TrainConfig  # noqa: E402
 from training.latents import open_store  # noqa: E402
