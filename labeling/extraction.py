@@ -18,7 +18,7 @@ from labeling.extractors import Extractors
 from labeling.labels import Keypoints
 from labeling.observation import Look, looks_of
 from labeling.smoothing import smooth_tracks
-from labeling.tracking import RunTracker, drop_passing_tracks
+from labeling.tracking import RunTracker, TrackerSettings, drop_passing_tracks
 
 Effort = Literal["fast", "balanced", "exact"]
 
@@ -124,7 +124,7 @@ class _Channel:
         self.look, self.settings = look, settings
         self.labels: list[Keypoints] = []
         self.looks = 0
-        self._tracker = RunTracker()
+        self._tracker = RunTracker(TrackerSettings(high_score=look.sure_score))
         self._forget()
 
     def _forget(self) -> None:

@@ -20,6 +20,8 @@ class Look(Protocol):
 
     carries: bool
     """Whether the points it gives lie on things that optical flow can follow."""
+    sure_score: float
+    """Objects that score at least this may start a track."""
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """Untracked labels of an (H, W, 3) uint8 RGB frame, numbered ``number``."""
@@ -45,6 +47,7 @@ class ObjectLook:
     """Boxes of a detector, with the points of the heads in them."""
 
     carries = True
+    sure_score = 0.5
 
     def __init__(self, extractors: Extractors, categories: tuple[Category, ...]) -> None:
         self.extractors, self.categories = extractors, categories
@@ -79,6 +82,9 @@ class ObjectLook:
 
 class FieldLook:
     """Objects of a bottom-up network."""
+
+    # A mean over all points, hidden ones too: a car seen whole scores about 0.5, one half seen about 0.3.
+    sure_score = 0.25
 
     def __init__(self, model: FieldModel, categories: frozenset[Category]) -> None:
         self.model, self.categories = model, categories

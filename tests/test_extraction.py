@@ -25,6 +25,7 @@ class MovingCard:
     """A textured card that slides and grows over a textured wall; it knows where its 24 points are in every frame."""
 
     carries = True
+    sure_score = 0.5
 
     def __init__(
         self, *, speed: float = 2.0, growth: float = 0.0, cut: int | None = None, shown: range = range(999)
