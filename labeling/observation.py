@@ -9,7 +9,7 @@ from labeling.detection import Detections
 from labeling.extractors import Extractors
 from labeling.fields import FieldModel
 from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
-from labeling.schemas import Category, keypoint_schema
+from labeling.schemas import CATEGORIES, Category, keypoint_schema
 
 _BOX_SCHEMA: dict[Category, str] = {"car": "car24", "person": "coco17"}
 """The schema of an object whose keypoints no network gives: a box with absent points still has a track."""
@@ -35,11 +35,12 @@ def looks_of(extractors: Extractors) -> list[Look]:
     if extractors.detector:
         categories = tuple(c for c in _BOX_SCHEMA if c in extractors.heads or c not in bottom_up)
         looks.append(ObjectLook(extractors, categories))
-    taken = frozenset[Category](extractors.heads)
+    taken: set[str] = set(extractors.heads)
     for model in extractors.fields:
-        wanted = frozenset[Category](keypoint_schema(name).category for name in model.schema_names) - taken
+        given = {keypoint_schema(name).category for name in model.schema_names}
+        wanted = tuple(category for category in CATEGORIES if category in given - taken)
         looks.append(FieldLook(model, wanted))
-        taken |= wanted
+        taken |= given
     return looks
 
 
@@ -86,9 +87,9 @@ class FieldLook:
     # A mean over all points, hidden ones too: a car seen whole scores about 0.5, one half seen about 0.3.
     sure_score = 0.25
 
-    def __init__(self, model: FieldModel, categories: frozenset[Category]) -> None:
+    def __init__(self, model: FieldModel, categories: tuple[Category, ...]) -> None:
         self.model, self.categories = model, categories
-        self.carries = categories != {"lane"}
+        self.carries = categories != ("lane",)
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""
