@@ -31,17 +31,24 @@ class Look(Protocol):
 def looks_of(extractors: Extractors) -> list[Look]:
     """The looks that the opened networks allow, each independent of the others."""
     looks: list[Look] = []
-    bottom_up = {keypoint_schema(name).category for model in extractors.fields for name in model.schema_names}
+    bottom_up = set[Category]().union(*(_categories(model) for model in extractors.fields))
     if extractors.detector:
         categories = tuple(c for c in _BOX_SCHEMA if c in extractors.heads or c not in bottom_up)
         looks.append(ObjectLook(extractors, categories))
-    taken: set[str] = set(extractors.heads)
+    taken: set[Category] = set(extractors.heads)
     for model in extractors.fields:
-        given = {keypoint_schema(name).category for name in model.schema_names}
+        given = _categories(model)
         wanted = tuple(category for category in CATEGORIES if category in given - taken)
         looks.append(FieldLook(model, wanted))
         taken |= given
     return looks
+
+
+def _categories(model: FieldModel) -> set[Category]:
+    found: set[Category] = set()
+    for name in model.schema_names:
+        found.add(keypoint_schema(name).category)
+    return found
 
 
 class ObjectLook:
