@@ -207,11 +207,14 @@ def _extended(
 ) -> Selection:
     """Videos that are new or changed are judged by what was frozen; the others stay as they are."""
     same = {name for name in candidates if previous.digests.get(name) == digests[name]}
-    rows = [row for row in previous.rows if row.video_id in same]
-    known = {row.video_id: row.split for row in previous.rows if row.split}
     new = [name for name in candidates if name not in same]
     rounds = previous.rounds + any(name not in previous.digests for name in new)
-    splits = {**_hashed_splits(new, rule), **known}
+    known = {row.video_id: row.split for row in previous.rows if row.split}
+    # What a person says of a video holds whenever it is said; the hash's word is kept.
+    splits = video_splits(list(candidates), rule) if rule.split else {**_hashed_splits(new, rule), **known}
+    rows = [
+        replace(row, split=splits[row.video_id]) if row.kept else row for row in previous.rows if row.video_id in same
+    ]
     old_round = {row.video_id: row.round for row in previous.rows}
     for name in new:
         for row in candidates[name]:

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from rich.table import Table
 
 from dataset.inspection import clip_record, contact_sheet, find_sample, summarize, write_contact_sheet
 from dataset.loader import Sample, ShardDataset
-from dataset.receipts import storage_errors
+from dataset.receipts import atomic_write, storage_errors
 from dataset.street import Scenario, Street, StreetConfig, write_street_video
 from labeling.errors import DataError
 from labeling.video import read_frames
@@ -44,6 +45,10 @@ _STREETS: dict[str, tuple[Scenario, int]] = {
     "avenue": ("traffic", 11), "market": ("crossing", 12), "country": ("empty", 13), "bend": ("turn", 14),
 }  # fmt: skip
 """Scenario and seed by video id."""
+_SETTINGS = {
+    "select": {"keep_share": 0.5, "split": {name: "val" if name == "market" else "train" for name in _STREETS}},
+    "keypoints": {"extractors": ["street"]},
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +87,8 @@ def run_demo(out: Path, *, workers: int | None = None) -> int:
         videos = write_streets(out / "videos", workers=workers)
     job = out / "job"
     with _timed(times, "label"):
-        code = run_label(videos, job, JobOptions(extractors="street", keep_share=0.5, workers=workers))
+        atomic_write(out / "demo.yaml", yaml.safe_dump(_SETTINGS).encode())
+        code = run_label(videos, job, JobOptions(config=out / "demo.yaml", workers=workers))
     sample = find_sample(job)
     write_contact_sheet(sample, out / "sheet.png")
     truth = compare_with_truth(job)
@@ -273,7 +279,7 @@ def _generated_section(sample: Sample, files: Any) -> Section:
     streams: list[Sequence[np.ndarray]] = [list(sample.iterate_frames("rgb.mp4"))]
     streams += [list(read_frames(path)) for path in (files.control, files.rgb) if path is not None]
     count = min(len(frames) for frames in streams)
-    video = mp4_data([tiled([frames[index] for frames in streams]) for index in range(count)])
+    video = mp4_data([tiled([frames[index] for frames in streams]) for index in range(count)], crf=36)
     pictures = [
         Picture(kind="video", data=video, caption="The clip itself, the generated skeletons, the generated RGB"),
         Picture(data=png_data(contact_sheet(sample)), caption=f"{sample.key}, whose first frame it starts from"),

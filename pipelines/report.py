@@ -28,7 +28,7 @@ from pipelines.layout import REPORT, SELECTION
 from pipelines.status import JobStatus, failure_lines, job_status
 
 _TEMPLATE = Path(__file__).with_name("templates") / "report.html"
-_QUARTER = (528, 352)
+_QUARTER = (384, 256)
 _ACCENT, _GREY, _PAPER = "#c2410c", "#94a3b8", "#ffffff"
 
 
@@ -199,8 +199,8 @@ def tiled(frames: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(rows, axis=0)
 
 
-def mp4_data(frames: Sequence[np.ndarray], *, fps: int = 24) -> str:
-    """Frames as an H.264 video in a ``data:`` address.
+def mp4_data(frames: Sequence[np.ndarray], *, fps: int = 24, crf: int = 30) -> str:
+    """Frames as an H.264 video in a ``data:`` address; ``crf`` bounds its size.
 
     Raises:
         DataError: no frames.
@@ -210,17 +210,19 @@ def mp4_data(frames: Sequence[np.ndarray], *, fps: int = 24) -> str:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clip.mp4"
         height, width = frames[0].shape[:2]
-        with VideoWriter(path, width=width, height=height, fps=fps, settings=EncoderSettings(crf=26)) as writer:
+        with VideoWriter(
+            path, width=width, height=height, fps=fps, settings=EncoderSettings(crf=crf, preset="medium")
+        ) as writer:
             for frame in frames:
                 writer.write(frame)
         return "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
 def png_data(picture: np.ndarray) -> str:
-    """(H, W, 3) uint8 RGB as a ``data:`` address: PNG, or JPEG where that is much smaller."""
+    """(H, W, 3) uint8 RGB as a ``data:`` address: PNG, or JPEG where that is much smaller (photographs)."""
     bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     kinds = {"png": cv2.imencode(".png", bgr)[1], "jpeg": cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 88])[1]}
-    kind = "jpeg" if len(kinds["png"]) > 3 * len(kinds["jpeg"]) else "png"
+    kind = "jpeg" if len(kinds["png"]) > 2 * len(kinds["jpeg"]) else "png"
     return f"data:image/{kind};base64," + base64.b64encode(kinds[kind].tobytes()).decode()
 
 
@@ -240,6 +242,10 @@ def figure_pixels(figure: Figure) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+def _legend_above(axes: Any) -> None:
+    axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0)
+
+
 def draw_objects(selection: Selection) -> np.ndarray:
     """How many objects the clips show, and where the threshold lies."""
     figure, axes = new_axes()
@@ -251,7 +257,7 @@ def draw_objects(selection: Selection) -> np.ndarray:
                   label=["kept", "dropped"])  # fmt: skip
         if selection.threshold is not None:
             axes.axvline(selection.threshold, color="#1e293b", linewidth=1, linestyle="--")
-        axes.legend(frameon=False)
+        _legend_above(axes)
     else:
         axes.text(0.5, 0.5, "every clip is kept, so nothing was counted", ha="center", transform=axes.transAxes)
     axes.set_xlabel("objects per clip")
@@ -265,9 +271,9 @@ def draw_trajectories(root: Path, *, most: int = 200) -> np.ndarray:
     samples = [sample for split in ("train", "val") for sample in ShardDataset(root, split)] if _packed(root) else []
     for number, sample in enumerate(samples[:most]):
         path = sample.cam_to_world[:, :3, 3]
-        axes.plot(path[:, 0], path[:, 2], linewidth=1.4, alpha=0.8, color=_ACCENT if number == 0 else None)
-    axes.set_xlabel("to the right, m")
-    axes.set_ylabel("ahead, m")
+        axes.plot(path[:, 2], -path[:, 0], linewidth=1.4, alpha=0.8, color=_ACCENT if number == 0 else None)
+    axes.set_xlabel("ahead, m")
+    axes.set_ylabel("to the left, m")
     axes.set_aspect("equal", adjustable="datalim")
     return figure_pixels(figure)
 
@@ -287,5 +293,5 @@ def draw_losses(curves: Mapping[str, Sequence[float]]) -> np.ndarray:
         axes.plot(steps[span - 1 :], smooth, color=colour, linewidth=2, label=name)
     axes.set_xlabel("step")
     axes.set_ylabel("loss")
-    axes.legend(frameon=False)
+    _legend_above(axes)
     return figure_pixels(figure)

@@ -182,7 +182,8 @@ class SelectStage:
             keep_share=settings.keep_share, seed=settings.seed, sample_clips=settings.sample_clips,
             val_share=settings.val_share, split=split,
         )  # fmt: skip
-        rule_values = {key: value for key, value in item.settings["select"].items() if key != "split"}
+        # A split that names more videos than before is no other rule.
+        rule_values = {**item.settings["select"], "split": split is not None}
         selection = select_clips(
             candidates, rule, digests={video_id: digest(facts) for video_id, facts in videos.items()},
             rule_digest=digest([item.version, {**item.settings, "select": rule_values}]),

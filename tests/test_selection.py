@@ -117,6 +117,14 @@ def test_a_changed_rule_makes_a_new_selection_and_cannot_be_extended():
         select(VIDEOS, mode="extend")
 
 
+def test_a_split_that_is_given_holds_whenever_it_is_said():
+    videos = {name: VIDEOS[name] for name in ("v0", "v1")}
+    first = select(videos, SelectionRule(split={"v0": "train", "v1": "train"}))
+    second = select(videos, SelectionRule(split={"v0": "train", "v1": "val"}), previous=first)
+    assert {row.split for row in second.kept if row.video_id == "v1"} == {"val"}
+    assert second.threshold == first.threshold and second.rounds == 0
+
+
 def test_refreezing_computes_the_threshold_anew():
     low = {name: rows(name, [0.0, 1.0]) for name in ("a", "b")}
     high = {**low, **{name: rows(name, [8.0, 9.0]) for name in ("c", "d", "e", "f")}}
