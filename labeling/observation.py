@@ -33,12 +33,12 @@ def looks_of(extractors: Extractors) -> list[Look]:
     looks: list[Look] = []
     bottom_up = set[Category]().union(*(_categories(model) for model in extractors.fields))
     if extractors.detector:
-        categories = tuple(c for c in _BOX_SCHEMA if c in extractors.heads or c not in bottom_up)
+        categories: list[Category] = [c for c in _BOX_SCHEMA if c in extractors.heads or c not in bottom_up]
         looks.append(ObjectLook(extractors, categories))
     taken: set[Category] = set(extractors.heads)
     for model in extractors.fields:
         given = _categories(model)
-        wanted = tuple(category for category in CATEGORIES if category in given - taken)
+        wanted: list[Category] = [category for category in CATEGORIES if category in given - taken]
         looks.append(FieldLook(model, wanted))
         taken |= given
     return looks
@@ -57,7 +57,7 @@ class ObjectLook:
     carries = True
     sure_score = 0.5
 
-    def __init__(self, extractors: Extractors, categories: tuple[Category, ...]) -> None:
+    def __init__(self, extractors: Extractors, categories: Sequence[Category]) -> None:
         self.extractors, self.categories = extractors, categories
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
@@ -94,9 +94,9 @@ class FieldLook:
     # A mean over all points, hidden ones too: a car seen whole scores about 0.5, one half seen about 0.3.
     sure_score = 0.25
 
-    def __init__(self, model: FieldModel, categories: tuple[Category, ...]) -> None:
+    def __init__(self, model: FieldModel, categories: Sequence[Category]) -> None:
         self.model, self.categories = model, categories
-        self.carries = categories != ("lane",)
+        self.carries = list(categories) != ["lane"]
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""
