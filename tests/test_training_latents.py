@@ -215,3 +215,30 @@ def test_weights_folder_and_missing_weights(tmp_path: Path) -> None:
     assert denoiser.config["num_layers"] == 2
     with pytest.raises(ModelError, match="could not be loaded from"):
         load_backbone(backbone_config("ltx-2b", **{**told, "weights": str(tmp_path / "none")}), parts=["vae"])
+
+
+def test_a_single_file_in_lightricks_own_names_loads(tmp_path: Path) -> None:
+    """One file with the transformer under ``model.diffusion_model.``, as the released checkpoints are laid out."""
+    from safetensors.torch import save_file
+
+    from labeling.errors import ModelError
+    from training.tiny import tiny_transformer
+
+    names = {"proj_in": "patchify_proj", "time_embed": "adaln_single", "norm_q": "q_norm", "norm_k": "k_norm"}
+    tensors = {}
+    for key, tensor in tiny_transformer().state_dict().items():
+        for ours, theirs in names.items():
+            key = key.replace(ours, theirs)
+        tensors[f"model.diffusion_model.{key}"] = tensor
+    save_file(tensors, tmp_path / "ltx.safetensors")
+    tiny_transformer().save_config(tmp_path / "configs" / "transformer")
+    told = {
+        "kind": "ltx", "size": "2b", "weights": str(tmp_path / "ltx.safetensors"), "dtype": "float32",
+        "weights_config": str(tmp_path / "configs"),
+    }  # fmt: skip
+    backbone = load_backbone(backbone_config("ltx-2b", **told))
+    wanted, found = tiny_transformer().state_dict(), backbone.denoiser.state_dict()
+    assert wanted.keys() == found.keys()
+    assert all(torch.equal(wanted[key], found[key]) for key in wanted)
+    with pytest.raises(ModelError, match=r"set backbone\.text_weights"):
+        backbone.encode_text(["A road."])

@@ -56,6 +56,9 @@ class BackboneConfig(_Settings):
     size: Literal["tiny", "2b", "13b", "svd"] = "tiny"
     weights: str | None = None
     """Local folder, single safetensors file, or hub id; None only for the tiny kinds (random, from ``seed``)."""
+    weights_config: str | None = None
+    """For a single file: the folder or hub id whose ``transformer`` and ``vae`` configurations fit. None lets
+    diffusers tell by the file's keys and fetch them, which needs the hub."""
     text_weights: str | None = None
     """Text encoder and tokenizer, where they are not part of ``weights``."""
     dtype: Literal["float32", "bfloat16"] = "float32"

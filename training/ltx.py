@@ -208,9 +208,11 @@ def load_ltx(config: BackboneConfig, *, device: str | torch.device = "cpu", part
 
 
 def _makers(config: BackboneConfig, source: str) -> dict[str, Callable[[], Any]]:
-    dtype, text_source = getattr(torch, config.dtype), config.text_weights or source
+    dtype, text_source, told = getattr(torch, config.dtype), config.text_weights or source, config.weights_config
     return {
-        "denoiser": lambda: load_pretrained(LTXVideoTransformer3DModel, source, "transformer", dtype=dtype),
-        "vae": lambda: load_pretrained(AutoencoderKLLTXVideo, source, "vae", dtype=dtype),
+        "denoiser": lambda: load_pretrained(
+            LTXVideoTransformer3DModel, source, "transformer", dtype=dtype, file_config=told
+        ),
+        "vae": lambda: load_pretrained(AutoencoderKLLTXVideo, source, "vae", dtype=dtype, file_config=told),
         "text": lambda: load_text_encoder(text_source, dtype=dtype, single_file=Path(source).is_file()),
     }

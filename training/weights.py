@@ -15,7 +15,9 @@ _HOW_IT_WAS_LOADED = ("dtype", "torch_dtype", "architectures")
 _ADVICE = "give a local diffusers folder, a .safetensors file, or a hub id that this machine can reach"
 
 
-def load_pretrained(kind: Any, source: str, subfolder: str, *, dtype: torch.dtype) -> Any:
+def load_pretrained(
+    kind: Any, source: str, subfolder: str, *, dtype: torch.dtype, file_config: str | None = None
+) -> Any:
     """A diffusers model from a folder or hub id (its ``subfolder``), or from a single-file checkpoint.
 
     Args:
@@ -23,13 +25,15 @@ def load_pretrained(kind: Any, source: str, subfolder: str, *, dtype: torch.dtyp
         source: folder, ``.safetensors`` file, or hub id.
         subfolder: the model's part of a folder or hub repository.
         dtype: of the weights in memory.
+        file_config: folder or hub id whose configuration a single file fits; None lets diffusers fetch it.
 
     Raises:
         ModelError: nothing there, or not this class's weights.
     """
     try:
         if Path(source).is_file():
-            return kind.from_single_file(source, torch_dtype=dtype)
+            where = {"config": file_config, "subfolder": subfolder} if file_config else {}
+            return kind.from_single_file(source, torch_dtype=dtype, **where)
         return kind.from_pretrained(source, subfolder=subfolder, torch_dtype=dtype, use_safetensors=True)
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise ModelError(
