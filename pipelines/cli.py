@@ -7,33 +7,32 @@ from typing import Annotated
 
 import typer
 
+from pipelines.cli_options import (
+    LABEL,
+    LOOK,
+    STAGES,
+    AsJson,
+    ConfigFile,
+    Effort,
+    Extractors,
+    JobFolder,
+    KeepShare,
+    LeaveOut,
+    Models,
+    MoreVideos,
+    Out,
+    PartOf,
+    Videos,
+    Wait,
+    Workers,
+)
+from pipelines.cli_training import commands as training_commands
+
 app = typer.Typer(
     name="animatic",
     help="Motion Appearance Decoupling for driving world models: raw driving videos in, two trained adapters out.",
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich",
 )  # fmt: skip
-
-LABEL, STAGES, LOOK, TRAIN, MEASURE = "Label videos", "Single stages", "Look", "Train and sample", "Measure"
-
-Videos = Annotated[list[Path], typer.Argument(help="Video files, folders of them, or text files of paths.")]
-MoreVideos = Annotated[
-    list[Path] | None,
-    typer.Argument(help="Video files, folders of them, or text files of paths; a job that is there keeps its own."),
-]
-Out = Annotated[Path, typer.Option("--out", "-o", help="The job's folder.")]
-JobFolder = Annotated[Path, typer.Argument(help="The job's folder.")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="Settings in YAML.")]
-Effort = Annotated[str | None, typer.Option("--effort", help="fast, balanced or exact.")]
-KeepShare = Annotated[float | None, typer.Option(help="Share of the clips to keep, by objects; 1 keeps every clip.")]
-Models = Annotated[Path | None, typer.Option("--models", help="Folder of ONNX weights.")]
-Extractors = Annotated[
-    str | None, typer.Option(help="Model cards by name, with commas; 'street' for the shipped ones.")
-]
-Workers = Annotated[int | None, typer.Option(min=0, help="Processes; by default one per core.")]
-PartOf = Annotated[str | None, typer.Option("--part", help="i/n: this host's share of the videos.")]
-LeaveOut = Annotated[Path | None, typer.Option(help="CSV of video_id,start_s,end_s: seconds to leave out at each end.")]
-Wait = Annotated[float, typer.Option(help="Minutes to wait for other parts that make no progress.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def main() -> None:
@@ -271,100 +270,4 @@ def export_released(
     raise typer.Exit(export(job, out, split=split))
 
 
-@app.command(rich_help_panel=TRAIN)
-def cache(
-    job: JobFolder,
-    backbone: Annotated[str, typer.Option(help="A preset (tiny, ltx-2b, ltx-13b, svd ...) or a YAML file.")],
-    part: Annotated[str | None, typer.Option(help="i/n: this host's share of the clips.")] = None,
-    object_variants: Annotated[int, typer.Option(min=1, help="Object videos per clip.")] = 1,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    refresh: Annotated[bool, typer.Option("--refresh", help="Throw away what was made with other settings.")] = False,
-) -> None:
-    """Latents of every clip, once per backbone."""
-    from pipelines.train import run_cache
-
-    run_cache(job, backbone=backbone, part=part, object_variants=object_variants, device=device, refresh=refresh)
-
-
-@app.command(rich_help_panel=TRAIN)
-def train(
-    stage: Annotated[str, typer.Argument(help="motion, appearance or end_to_end.")],
-    data: Annotated[Path, typer.Option(help="A job whose latents are cached.")],
-    config: Annotated[str, typer.Option(help="A recipe by name (tiny, motion_ltx_2b ...) or a YAML file.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="By default JOB/adapters/<recipe>_<stage>.")] = None,
-    resume: Annotated[str, typer.Option(help="auto, never, or a checkpoint.")] = "auto",
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what it would take; load nothing.")] = False,
-    steps_per_second: Annotated[float | None, typer.Option(help="For the dry run's hours.")] = None,
-) -> None:
-    """One LoRA adapter on the frozen backbone."""
-    from pipelines.train import run_train
-
-    result = run_train(
-        stage, data=data, config=config, out=out, resume=resume, dry_run=dry_run, steps_per_second=steps_per_second
-    )
-    raise typer.Exit(1 if getattr(result, "interrupted", False) else 0)
-
-
-@app.command(rich_help_panel=TRAIN)
-def generate(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the videos.")],
-    motion: Annotated[Path | None, typer.Option(help="Adapter of the motion stage.")] = None,
-    appearance: Annotated[Path | None, typer.Option(help="Adapter of the appearance stage.")] = None,
-    end_to_end: Annotated[Path | None, typer.Option(help="Adapter of the baseline, instead of both.")] = None,
-    image: Annotated[Path | None, typer.Option(help="The first frame.")] = None,
-    caption: Annotated[str | None, typer.Option(help="What the clip shows.")] = None,
-    data: Annotated[Path | None, typer.Option(help="A job: start from one of its clips instead.")] = None,
-    clip: Annotated[str | None, typer.Option(help="Which clip of the job; by default the first.")] = None,
-    skeleton: Annotated[Path | None, typer.Option(help="The first skeleton; by default extracted.")] = None,
-    skeleton_video: Annotated[Path | None, typer.Option(help="All skeletons, instead of the motion stage.")] = None,
-    ego: Annotated[str | None, typer.Option(help="Trajectory file, or words such as 'straight 10m/s'.")] = None,
-    objects: Annotated[Path | None, typer.Option(help="Object video, or labels in Parquet.")] = None,
-    backbone: Annotated[str | None, typer.Option(help="By default the adapters' own.")] = None,
-    samples: Annotated[int, typer.Option(min=1)] = 1,
-    seed: Annotated[int, typer.Option()] = 0,
-    steps: Annotated[int, typer.Option(min=1, help="Denoising steps per stage.")] = 30,
-    guidance: Annotated[float, typer.Option(help="Classifier-free guidance.")] = 3.0,
-    coordinates: Annotated[
-        str, typer.Option(help="consistent, or released with the released adapters.")
-    ] = "consistent",
-    frames: Annotated[int | None, typer.Option(help="By default what the adapters were trained on.")] = None,
-    extractors: Extractors = None,
-    models: Models = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
-) -> None:
-    """A skeleton video, then an RGB video painted over it."""
-    from pipelines.train import GenerateOptions, run_generate
-
-    options = GenerateOptions(
-        backbone=backbone, skeleton_video=skeleton_video, objects=objects, samples=samples, seed=seed, steps=steps,
-        guidance=guidance, coordinates=coordinates, frames=frames,
-        extractors=tuple(extractors.split(",")) if extractors else None, models_dir=models, device=device,
-    )  # fmt: skip
-    run_generate(
-        out=out, motion=motion, appearance=appearance, end_to_end=end_to_end, image=image, caption=caption,
-        skeleton=skeleton, ego=ego, data=data, clip=clip, options=options,
-    )  # fmt: skip
-
-
-@app.command(rich_help_panel=MEASURE)
-def chart(
-    stage: Annotated[str, typer.Argument(help="Which chart; an unknown name lists them.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for chart-<stage>.json and .png.")] = Path("charts"),
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer runs on less data.")] = False,
-) -> None:
-    """Speed against accuracy: a stage's methods side by side, with the Pareto front."""
-    from pipelines.measure import show_chart
-
-    raise typer.Exit(show_chart(stage, out=out, quick=quick))
-
-
-@app.command(rich_help_panel=MEASURE)
-def stability(
-    stage: Annotated[str, typer.Argument(help="Which stage; an unknown name lists them.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the table.")] = Path("charts"),
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer runs on less data.")] = False,
-) -> None:
-    """Where methods fail: named scenarios, a bound each, held or not."""
-    from pipelines.measure import show_stability
-
-    raise typer.Exit(show_stability(stage, out=out, quick=quick))
+app.add_typer(training_commands)

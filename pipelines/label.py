@@ -8,7 +8,8 @@ from typing import Protocol
 
 from dataset.receipts import Receipt
 from labeling.errors import StorageError
-from pipelines.engine import Engine, Task
+from pipelines.engine import Engine
+from pipelines.items import Task
 from pipelines.job import Job
 from pipelines.stage import STAGES, NotReadyError, Part, item_state
 

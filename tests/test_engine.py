@@ -12,7 +12,8 @@ import pytest
 from dataset.receipts import ReceiptLog, read_receipts
 from labeling.errors import VideoError
 from pipelines import stage as stage_module
-from pipelines.engine import Engine, Task, perform, sweep_staging
+from pipelines.engine import Engine
+from pipelines.items import Task, perform, sweep_staging
 from pipelines.stage import DroppedError, WorkItem, item_state
 
 
@@ -129,16 +130,16 @@ def test_a_worker_that_dies_does_not_take_the_others_along(tmp_path):
 
 
 def test_the_old_receipt_is_withdrawn_before_its_outputs_are_replaced(tmp_path, monkeypatch):
-    from pipelines import engine
+    from pipelines import items
 
     first = run(tmp_path, [item(text="one")])
-    publish = engine.publish
+    publish = items.publish
 
     def killed(staging, job, names):
         publish(staging, job, names[:1])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(engine, "publish", killed)
+    monkeypatch.setattr(items, "publish", killed)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, [item(text="two")], previous=first)
     monkeypatch.undo()
@@ -173,7 +174,7 @@ def _fields(receipt):
 def test_workers_die_with_their_parent(tmp_path):
     code = (
         "import sys; from pathlib import Path\n"
-        "from pipelines.engine import Engine, Task; from test_engine import item\n"
+        "from pipelines.engine import Engine; from test_engine import Task, item\n"
         "if __name__ == '__main__':\n"
         "    with Engine(Path(sys.argv[1]), workers=1) as engine:\n"
         "        list(engine.run([Task(item=item('a', do='slow'))]))\n"

@@ -1,0 +1,28 @@
+"""Options that several commands share."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+LABEL, STAGES, LOOK, TRAIN, MEASURE = "Label videos", "Single stages", "Look", "Train and sample", "Measure"
+
+Videos = Annotated[list[Path], typer.Argument(help="Video files, folders of them, or text files of paths.")]
+MoreVideos = Annotated[
+    list[Path] | None,
+    typer.Argument(help="Video files, folders of them, or text files of paths; a job that is there keeps its own."),
+]
+Out = Annotated[Path, typer.Option("--out", "-o", help="The job's folder.")]
+JobFolder = Annotated[Path, typer.Argument(help="The job's folder.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Settings in YAML.")]
+Effort = Annotated[str | None, typer.Option("--effort", help="fast, balanced or exact.")]
+KeepShare = Annotated[float | None, typer.Option(help="Share of the clips to keep, by objects; 1 keeps every clip.")]
+Models = Annotated[Path | None, typer.Option("--models", help="Folder of ONNX weights.")]
+Extractors = Annotated[
+    str | None, typer.Option(help="Model cards by name, with commas; 'street' for the shipped ones.")
+]
+Workers = Annotated[int | None, typer.Option(min=0, help="Processes; by default one per core.")]
+PartOf = Annotated[str | None, typer.Option("--part", help="i/n: this host's share of the videos.")]
+LeaveOut = Annotated[Path | None, typer.Option(help="CSV of video_id,start_s,end_s: seconds to leave out at each end.")]
+Wait = Annotated[float, typer.Option(help="Minutes to wait for other parts that make no progress.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
