@@ -75,17 +75,19 @@ def print_error(error: Exception) -> None:
     make_console(stderr=True).print(f"[bold red]error:[/] {escape(' '.join(str(error).split()))}")
 
 
-def print_failures(failed: Sequence[Receipt], console: Console) -> None:
-    """Which items failed, and why."""
+def print_failures(failed: Sequence[Receipt], console: Console, *, most: int = 20) -> None:
+    """Which items failed, and why; of many, the first ``most``."""
     if not failed:
         return
     table = Table(title=f"{len(failed)} failed", title_style="bold red", title_justify="left", box=None, pad_edge=False)
     for column in ("stage", "item", "reason", "again?"):
         table.add_column(column, style="dim" if column == "stage" else "")
-    for receipt in failed:
+    for receipt in failed[:most]:
         again = "run again" if receipt.retryable else "no"
         table.add_row(receipt.stage, receipt.item, escape(receipt.message), again)
     console.print(table)
+    if len(failed) > most:
+        console.print(f"... and {len(failed) - most} more; `animatic status` counts them by reason")
 
 
 def duration(seconds: float) -> str:
