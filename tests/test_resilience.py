@@ -19,7 +19,7 @@ from pipeline_fixtures import SilentReporter, run_all, small_config, tree, write
 from dataset import receipts
 from dataset.receipts import ReceiptLog, read_receipts
 from labeling.errors import StorageError
-from pipelines import engine
+from pipelines import engine, items
 from pipelines.job import Job, find_videos
 from pipelines.label import StageReport, run_stages
 from pipelines.stage import STAGES, NotReadyError
@@ -67,7 +67,7 @@ def die() -> None:
 
 def run_and_die(job: Job, stage: str, moment: str) -> None:
     """Run the job, and be killed at that moment of the stage's first item."""
-    publish, append = engine.publish, ReceiptLog.append
+    publish, append = items.publish, ReceiptLog.append
     if moment == MOMENTS[0]:
 
         def publish_nothing(staging: Path, *args: object) -> object:
@@ -75,7 +75,7 @@ def run_and_die(job: Job, stage: str, moment: str) -> None:
                 die()
             return publish(staging, *args)  # type: ignore[arg-type]
 
-        engine.publish = publish_nothing  # type: ignore[assignment]
+        items.publish = publish_nothing  # type: ignore[assignment]
     elif moment == MOMENTS[1]:
 
         def append_nothing(log: ReceiptLog, receipt: receipts.Receipt) -> None:
