@@ -93,7 +93,8 @@ def test_inspect_gives_a_summary_a_record_and_a_sheet(run, job, tmp_path):
     record = json.loads(out)
     assert (code, record["key"], record["start"]) == (0, "street_8", 8)
     assert record["caption"] and record["members"]["rgb.mp4"] > 0
-    assert cv2.imread(str(tmp_path / "s.png")).shape[1] > 2000
+    sheet = cv2.imread(str(tmp_path / "s.png"))
+    assert sheet is not None and sheet.shape[1] > 2000
     assert json.loads(run("inspect", job, "--json")[1])["packed"] == {"train": 2, "val": 0}
 
 

@@ -65,6 +65,7 @@ def test_a_summary_counts_what_there_is(job):
     assert (summary.clips, summary.kept, summary.packed) == (3, 2, {"train": 1, "val": 0})
     assert summary.dropped == {"cut": 1, "objects": 1}
     assert summary.failed == {"index": 1}
+    assert summary.objects_per_clip and summary.tracks_per_clip and summary.path_length_m
     assert summary.objects_per_clip.greatest == 4.0 and summary.threshold == 3.0
     assert summary.tracks_per_clip.total == 2 and summary.path_length_m.median == 40.0
     assert summary.bytes_by_kind["txt"] == 36
@@ -105,4 +106,5 @@ def test_a_sheet_has_a_row_for_each_video_that_is_there(job):
 
 def test_a_spread_of_nothing_is_none():
     assert spread([]) is None
-    assert (spread([3, 1, 2]).least, spread([3, 1, 2]).median, spread([3, 1, 2]).total) == (1, 2, 6)
+    found = spread([3, 1, 2])
+    assert found and (found.least, found.median, found.total) == (1, 2, 6)

@@ -56,7 +56,9 @@ def counted(tmp_path_factory, videos, detector):
 
 def test_the_clips_with_the_most_objects_are_kept_and_packed(counted):
     selection = read_selection(counted.root / "selection.parquet")
-    objects = {video: {r.objects for r in selection.rows if r.video_id == video} for video in ("dim", "day", "glare")}
+    objects = {
+        video: {r.objects or 0.0 for r in selection.rows if r.video_id == video} for video in ("dim", "day", "glare")
+    }
     assert max(objects["dim"]) < min(objects["day"]) < min(objects["glare"])
     assert {row.video_id for row in selection.rows if not row.kept} >= {"dim"}
     packed = [key for split in ("train", "val") for key in ShardDataset(counted.root, split).keys]
@@ -266,7 +268,7 @@ def test_left_out_seconds_keep_clips_away_from_both_ends(tmp_path, videos):
     run_all(job)
     rows = read_selection(job.root / "selection.parquet").rows
     assert [row.start for row in rows if row.kept] == [16, 24]
-    assert all(row.reason.startswith("left_out") for row in rows if not row.kept)
+    assert all((row.reason or "").startswith("left_out") for row in rows if not row.kept)
 
 
 def test_without_a_detector_clips_cannot_be_ranked(tmp_path, videos, monkeypatch):

@@ -1,5 +1,6 @@
 import json
 import os
+from typing import Any
 
 import pytest
 
@@ -19,7 +20,7 @@ from dataset.receipts import (
 from labeling.errors import DataError, StorageError
 
 
-def receipt(item="a", *, turn=1, state="done", key="k", **fields):
+def receipt(item="a", *, turn=1, state: Any = "done", key="k", **fields):
     return Receipt(stage="cut", item=item, state=state, key=key, turn=turn, **fields)
 
 

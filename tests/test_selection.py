@@ -39,8 +39,8 @@ VIDEOS = {f"v{n}": rows(f"v{n}", np.random.default_rng(n).integers(0, 9, 20).ast
 @given(st.lists(st.integers(0, 6), min_size=1, max_size=40), st.floats(0.05, 0.95))
 def test_the_kept_share_is_the_one_with_the_most_objects_and_ties_are_kept(counts, share):
     selection = select({"v": rows("v", [float(c) for c in counts])}, SelectionRule(keep_share=share))
-    kept = sorted(row.objects for row in selection.kept)
-    dropped = [row.objects for row in selection.rows if not row.kept]
+    kept = sorted(row.objects or 0.0 for row in selection.kept)
+    dropped = [row.objects or 0.0 for row in selection.rows if not row.kept]
     assert len(kept) >= share * len(counts) - 1e-6
     assert not dropped or max(dropped) < kept[0] == selection.threshold
     assert len([count for count in kept if count > kept[0]]) < share * len(counts) + 1e-6
@@ -89,7 +89,10 @@ def test_adding_a_video_changes_nothing_for_the_others(sample):
     assert [row for row in second.rows if row.video_id in first.digests] == list(first.rows)
     added = [row for row in second.rows if row.video_id not in first.digests]
     assert second.threshold == first.threshold
-    assert all((row.objects >= first.threshold) == (not (row.reason or "").startswith("objects")) for row in added)
+    assert all(
+        ((row.objects or 0.0) >= (first.threshold or 0.0)) == (not (row.reason or "").startswith("objects"))
+        for row in added
+    )
     assert {row.round for row in added} == {1} and {row.round for row in first.rows} == {0}
 
 
@@ -97,8 +100,7 @@ def test_a_sample_rank_does_not_depend_on_other_videos():
     rule = SelectionRule(keep_share=1.0, sample_clips=30)
     few = select({name: VIDEOS[name] for name in list(VIDEOS)[:8]}, rule)
     many = select(VIDEOS, rule)
-    cutoff = min(few.sample_cutoff, many.sample_cutoff)
-    assert cutoff == many.sample_cutoff
+    assert few.sample_cutoff and many.sample_cutoff and many.sample_cutoff < few.sample_cutoff
     assert {row.key for row in many.kept if row.video_id in few.digests} <= {row.key for row in few.kept}
 
 
@@ -155,7 +157,7 @@ def test_holes_and_short_videos_stay_in_the_table_with_their_reason():
     times = np.concatenate([np.arange(0, 10, 1 / 24), np.arange(11, 21, 1 / 24)])
     timeline = plan_timeline(times)
     found = candidate_rows("v", plan_clips(timeline), None)
-    assert {row.reason.split("=")[0] for row in found if not row.kept} == {"hole"}
+    assert {(row.reason or "").split("=")[0] for row in found if not row.kept} == {"hole"}
     assert all(row.kept == (row.reason is None) for row in found)
     short = candidate_rows("v", plan_clips(plan_timeline(times[:40])), None)
     assert [row.reason for row in short] == ["too_short: frames=40 < clip_frames=121"]
@@ -188,4 +190,4 @@ def test_objects_are_the_mean_over_looks_of_counted_classes_that_are_sure():
     none = count_objects(timeline, clips, look_times_s=np.zeros(0), classes=[], scores=[], counted={"car"}, min_score=0)
     assert none == [None, None]
     found = candidate_rows("v", plan_clips(timeline), [None] * len(plan_clips(timeline).kept))
-    assert all(not row.kept and row.reason.startswith("uncounted") for row in found)
+    assert all(not row.kept and (row.reason or "").startswith("uncounted") for row in found)

@@ -64,7 +64,8 @@ def test_rows_say_where_the_bytes_are(tmp_path):
     with tarfile.open(tmp_path / "train-000000.tar") as tar:
         for row, member in zip(rows, tar.getmembers(), strict=True):
             assert member.name == f"{row.key}.{row.member}" and member.mtime == 0
-            assert data[row.offset : row.offset + row.size] == tar.extractfile(member).read()
+            file = tar.extractfile(member)
+            assert file is not None and data[row.offset : row.offset + row.size] == file.read()
             assert read_member(tmp_path, row) == data[row.offset : row.offset + row.size]
 
 
