@@ -19,13 +19,6 @@ from labeling.errors import ConfigError
 
 CHARTS: dict[str, str] = {
     "count": "pipelines.charts_count",
-    "detect": "pipelines.charts_keypoints",
-    "keypoints": "pipelines.charts_keypoints",
-    "track": "pipelines.charts_keypoints",
-    "ego": "pipelines.charts_ego",
-    "ego-video": "pipelines.charts_ego_video",
-    "train": "pipelines.charts_train",
-    "generate": "pipelines.charts_train",
 }
 """The module of each chart; it has ``chart(name, *, quick) -> Chart``."""
 

@@ -10,10 +10,7 @@ from typing import Literal
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
 
-STABILITY: dict[str, str] = {
-    "ego": "pipelines.stability_ego",
-    "keypoints": "pipelines.stability_keypoints",
-}
+STABILITY: dict[str, str] = {}
 """The module of each table; it has ``stability(*, quick) -> StabilityTable``."""
 
 Verdict = Literal["held", "not held", "reported"]
