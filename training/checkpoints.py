@@ -11,6 +11,9 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
+import torch
+from safetensors.torch import save_file
+
 from dataset.receipts import storage_errors, sync_folder
 from labeling.errors import DataError
 
@@ -22,8 +25,14 @@ def checkpoint_folder(root: Path, step: int) -> Path:
     return root / f"step_{step:08d}"
 
 
-def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes], *, keep: int) -> Path:
+def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes | dict[str, torch.Tensor]], *, keep: int) -> Path:
     """Write a checkpoint and drop all but the newest ``keep``.
+
+    Args:
+        root: folder of the checkpoints.
+        step: optimiser steps done.
+        files: contents by name; tensors go to safetensors without a copy of them all in memory.
+        keep: how many to keep.
 
     Raises:
         StorageError: no space left, or the folder cannot be written to; earlier checkpoints are untouched.
@@ -33,11 +42,11 @@ def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes], *, keep: 
         shutil.rmtree(staged, ignore_errors=True)
         staged.mkdir(parents=True)
         try:
-            listed = {
-                name: {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in files.items()
-            }
             for name, data in files.items():
                 _write_synced(staged / name, data)
+            listed = {
+                name: {"size": (staged / name).stat().st_size, "sha256": _digest(staged / name)} for name in files
+            }
             _write_synced(staged / MANIFEST, json.dumps({"step": step, "files": listed}, sort_keys=True).encode())
             sync_folder(staged)
             shutil.rmtree(goal, ignore_errors=True)
@@ -49,11 +58,19 @@ def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes], *, keep: 
     return goal
 
 
-def _write_synced(path: Path, data: bytes) -> None:
-    with path.open("wb") as file:
-        file.write(data)
+def _write_synced(path: Path, data: bytes | dict[str, torch.Tensor]) -> None:
+    if isinstance(data, dict):
+        save_file(data, path)
+    with path.open("ab" if isinstance(data, dict) else "wb") as file:
+        if isinstance(data, bytes):
+            file.write(data)
         file.flush()
         os.fsync(file.fileno())
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _prune(root: Path, *, keep: int) -> None:
@@ -83,9 +100,8 @@ def check_checkpoint(path: Path) -> int:
         file = path / name
         if not file.is_file() or file.stat().st_size != wanted["size"]:
             raise DataError(f"{path}: {name} is missing or cut short; take an earlier checkpoint")
-        with file.open("rb") as stream:
-            if hashlib.file_digest(stream, "sha256").hexdigest() != wanted["sha256"]:
-                raise DataError(f"{path}: {name} does not match its manifest; take an earlier checkpoint")
+        if _digest(file) != wanted["sha256"]:
+            raise DataError(f"{path}: {name} does not match its manifest; take an earlier checkpoint")
     return step
 
 

@@ -171,7 +171,7 @@ class LatentStore:
         return _read_text(self.folder, caption)
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=32)
 def _read_text(folder: Path, caption: str) -> TextEmbedding:
     path = text_path(folder, caption)
     try:

@@ -12,7 +12,6 @@ from safetensors.torch import load_file
 from labeling.errors import DataError
 from training.adapters import adapter_bytes, put_adapter, read_adapter
 from training.config import TrainConfig
-from training.weights import tensor_bytes
 
 ADAPTER, OPTIMISER, STATE = "adapter.safetensors", "optimiser.safetensors", "state.json"
 _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
@@ -36,8 +35,8 @@ class RunState:
 def pack_state(
     denoiser: torch.nn.Module, optimiser: torch.optim.Optimizer, names: Sequence[str], *, config: TrainConfig,
     state: RunState, frames: int, prefix: str = "transformer",
-) -> dict[str, bytes]:  # fmt: skip
-    """Checkpoint files by name.
+) -> dict[str, bytes | dict[str, torch.Tensor]]:  # fmt: skip
+    """Checkpoint files by name: bytes, or tensors for a safetensors file.
 
     Args:
         denoiser: carries the adapter, named by the stage.
@@ -51,7 +50,7 @@ def pack_state(
     about = {"stage": config.stage, "step": state.step, "frames": frames, "config": config.model_dump(mode="json")}
     return {
         ADAPTER: adapter_bytes(denoiser, config.stage, config.adapter, about=about, prefix=prefix),
-        OPTIMISER: tensor_bytes(_moments(optimiser, names)),
+        OPTIMISER: _moments(optimiser, names),
         STATE: json.dumps(
             {
                 "step": state.step, "loader": state.loader, "loader_start": state.loader_start,

@@ -22,6 +22,7 @@ from labeling.fields import FieldModel
 from labeling.keypoints import KeypointHead
 from labeling.model_cards import SHIPPED_CARDS, CifcafCard, FieldHeadCard, ModelCard, SimccCard, YoloxCard, read_card
 from labeling.model_cards import write_card as write_model_card
+from labeling.schemas import Category
 from training.street_augment import AugmentSettings
 from training.street_batches import CLASSES, Batch, CropBatches, DetectorBatches, FieldBatches
 from training.street_export import export_model
@@ -52,6 +53,7 @@ PLANNED: tuple[Scenario, ...] = (
 )  # fmt: skip
 """Scenarios in turn; busy ones come more often."""
 _WINDOW = (352, 256)
+_CLASS_WEIGHTS: dict[Category, float] = {"car": 1.0, "person": 2.5}
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
 _FIELD_SIZE = (529, 353)
 _LICENCE = "Apache-2.0"
@@ -110,10 +112,11 @@ def _steps(count: int, share: float) -> int:
 
 def _detector_recipe(seed: int, share: float) -> Recipe:
     cells, strides = (torch.from_numpy(array) for array in grid_cells(*_WINDOW))
+    weights = torch.tensor([_CLASS_WEIGHTS[name] for name in CLASSES])
 
     def loss(network: nn.Module, batch: Batch) -> torch.Tensor:
         classes, boxes = batch.targets
-        return detector_loss(network(batch.pictures).float(), classes, boxes, cells, strides)
+        return detector_loss(network(batch.pictures).float(), classes, boxes, cells, strides, weights)
 
     card = YoloxCard(
         name="street_detector", file="street_detector.onnx", licence=_LICENCE, source=_SOURCE, classes=CLASSES,
@@ -124,7 +127,7 @@ def _detector_recipe(seed: int, share: float) -> Recipe:
         card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph,
         batches=lambda pool: DetectorBatches(pool=pool, size=_WINDOW, count=16, augment=AugmentSettings()),
         loss=loss,
-        fit=FitSettings(name=card.name, seed=seed, steps=_steps(3000, share)),
+        fit=FitSettings(name=card.name, seed=seed, steps=_steps(3200, share), learning_rate=3e-3),
     )  # fmt: skip
 
 
@@ -146,7 +149,7 @@ def _head_recipe(name: str, schema: str, seed: int, share: float) -> Recipe:
         batches=lambda pool: CropBatches(
             crops=pool.crops[category], schema=schema, size=size, count=64, augment=augment
         ),
-        fit=FitSettings(name=name, seed=seed, steps=_steps(1100 if category == "car" else 1600, share)),
+        fit=FitSettings(name=name, seed=seed, steps=_steps(900 if category == "car" else 1400, share)),
     )  # fmt: skip
 
 
@@ -174,7 +177,7 @@ def _field_recipe(name: str, schemas: tuple[str, ...], seed: int, share: float) 
         batches=lambda pool: FieldBatches(
             pool=pool, schemas=schemas, size=_FIELD_SIZE, count=8, augment=AugmentSettings()
         ),
-        fit=FitSettings(name=name, seed=seed, steps=_steps(1800, share)),
+        fit=FitSettings(name=name, seed=seed, steps=_steps(2000, share)),
     )  # fmt: skip
 
 

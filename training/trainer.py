@@ -127,7 +127,12 @@ class Trainer:
         if config.gradient_checkpointing:
             denoiser.enable_gradient_checkpointing()  # type: ignore[operator]
         if config.compile:
-            denoiser.compile_repeated_blocks()  # type: ignore[operator]
+            try:
+                denoiser.compile_repeated_blocks()  # type: ignore[operator]
+            except ValueError as error:
+                raise ConfigError(
+                    f"{config.backbone.name} cannot be compiled by blocks; set compile to false"
+                ) from error
         denoiser.train()
         return parameters
 
@@ -261,8 +266,10 @@ class Trainer:
             frames=self.store.manifest.frames, prefix=self.backbone.adapter_prefix,
         )  # fmt: skip
         save_checkpoint(self.out / "checkpoints", self.step, files, keep=self.config.checkpoint.keep)
+        adapter = files[ADAPTER]
+        assert isinstance(adapter, bytes)
         with storage_errors(self.out):
-            write_whole(self.out / ADAPTER, files[ADAPTER])
+            write_whole(self.out / ADAPTER, adapter)
 
     def _validate(self, log: RunLog) -> dict[str, float]:
         values = held_out_losses(self.backbone, self.items, self.store, self.config, accelerator=self.accelerator)
