@@ -18,11 +18,17 @@ def cache(
     object_variants: Annotated[int, typer.Option(min=1, help="Object videos per clip.")] = 1,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     refresh: Annotated[bool, typer.Option("--refresh", help="Throw away what was made with other settings.")] = False,
+    controls: Annotated[
+        str | None, typer.Option(help="Further control videos of the shards, by name: hdmap,...")
+    ] = None,
 ) -> None:
     """Latents of every clip, once per backbone."""
     from pipelines.train import run_cache
 
-    run_cache(job, backbone=backbone, part=part, object_variants=object_variants, device=device, refresh=refresh)
+    run_cache(
+        job, backbone=backbone, part=part, object_variants=object_variants, device=device, refresh=refresh,
+        controls=tuple(controls.split(",")) if controls else (),
+    )  # fmt: skip
 
 
 @commands.command(rich_help_panel=TRAIN)

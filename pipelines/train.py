@@ -1,6 +1,6 @@
 """What ``animatic cache``, ``train`` and ``generate`` do: options to the training package, and a few lines back."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -43,7 +43,7 @@ class GenerateOptions:
 
 def run_cache(
     job: Path, *, backbone: str, part: str | None = None, object_variants: int = 1, device: str = "cpu",
-    refresh: bool = False, picture: Mapping[str, Any] | None = None,
+    refresh: bool = False, picture: Mapping[str, Any] | None = None, controls: Sequence[str] = (),
 ) -> CacheSummary:  # fmt: skip
     """Cache a job's latents, with a bar.
 
@@ -59,7 +59,7 @@ def run_cache(
 
         summary = cache_latents(
             job, backbone_name=backbone, part=(share.index - 1, share.count) if share else (0, 1), progress=show,
-            object_variants=object_variants, device=device, refresh=refresh, picture=picture,
+            object_variants=object_variants, device=device, refresh=refresh, picture=picture, controls=controls,
         )  # fmt: skip
     make_console().print(
         f"{summary.made} clips encoded, {summary.kept} were there, {summary.captions} captions, "
