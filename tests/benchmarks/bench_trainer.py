@@ -31,7 +31,7 @@ from training.latents import open_store  # noqa: E402
 from training.trainer import Trainer  # noqa: E402
 
 WIDE = tiny.TINY_TRANSFORMER | {
-    "num_attention_heads": 16, "attention_head_dim": 32, "cross_attention_dim": 512, "num_layers": 10,
+    "num_attention_heads": 16, "attention_head_dim": 32, "cross_attention_dim": 512, "num_layers": 3,
 }  # fmt: skip
 
 
