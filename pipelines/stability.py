@@ -67,7 +67,9 @@ def run_stability(name: str, *, out: Path, quick: bool = False) -> StabilityTabl
         ConfigError: no table has that name.
     """
     if name not in STABILITY:
-        raise ConfigError(f"no stability table is called {name!r}; choose one of {', '.join(STABILITY) or 'none so far'}")
+        raise ConfigError(
+            f"no stability table is called {name!r}; choose one of {', '.join(STABILITY) or 'none so far'}"
+        )
     table: StabilityTable = importlib.import_module(STABILITY[name]).stability(quick=quick)
     write_stability(table, out)
     return table
