@@ -26,7 +26,7 @@ GRIC_OUTLIER = 2.0
 _RUNGS = ((2, 0), (2, 3), (3, 5))
 """Dimension of the manifold and parameters of still, turning, moving."""
 _INLIER = 3.0
-_SIDEWAYS_RAD = 0.7
+_SIDEWAYS_RAD = 0.5
 _STEPS = 9
 
 
@@ -93,7 +93,7 @@ def explain_pair(
         noise_floor: least standard deviation of a corner, normalised units.
         least_inlier_share: below it, five-point RANSAC and the homography's decomposition propose other starts.
     """
-    first, second, weight = corners.first, corners.second, corners.weight
+    first, second = corners.first, corners.second
     turn = _turn(corners, rotation, noise_floor)
     prior = (axis, axis_sigma)
     fit = _moving(corners, [(rotation, axis), (turn, axis)], noise_floor, prior)
@@ -115,9 +115,12 @@ def explain_pair(
     squares = (still, turning, moving_cost)
     inlier = moving_cost < _INLIER**2
     rotation_sigma, direction_sigma = _sigmas(information, noise / noise_floor)
+    rungs = zip(squares, _RUNGS, strict=True)
+    costs = np.array([gric(square, dimension=d, parameters=p) for square, (d, p) in rungs])
+    # A car that moves sideways: as if most corners were outliers.
+    costs[2] += 0.75 * GRIC_OUTLIER * sideways(axis)
     return PairMotion(
-        costs=np.array([gric(square, dimension=d, parameters=p) for square, (d, p) in zip(squares, _RUNGS,
-        strict=True)]), turn=turn, rotation=rotation, axis=axis, evidence=evidence,
+        costs=costs, turn=turn, rotation=rotation, axis=axis, evidence=evidence,
         rotation_sigma=rotation_sigma, axis_sigma=direction_sigma, noise=noise, inlier=inlier,
         inlier_shares=np.array([(square < _INLIER**2).mean() for square in squares]),
         parallax=float(np.median(np.abs(along[inlier]))) if inlier.any() else 0.0,

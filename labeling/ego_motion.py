@@ -198,9 +198,9 @@ def _confidence(step: Step | None, state: int) -> float:
         return 0.0
     motion = step.measured[0]
     share = float(motion.inlier_shares[state])
-    agreement = np.clip((share - 0.35) / 0.35, 0.0, 1.0)
+    agreement = np.clip((share - 0.4) / 0.4, 0.0, 1.0)
     enough = min(1.0, len(step.corners.ids) / 60.0)
-    undisputed = np.clip(1.5 - 1.5 * motion.second_share / max(share, 1e-3), 0.0, 1.0)
+    undisputed = np.clip(1.3 - 1.6 * motion.second_share / max(share, 1e-3), 0.0, 1.0)
     plausible = 1.0 - (sideways(motion.axis) if state == MOVING else 0.0)
     return float(agreement * enough * undisputed * plausible)
 

@@ -44,7 +44,7 @@ def run_speeds(
     """Smooth log speeds over every stretch of moving steps; 0 elsewhere.
 
     A stretch is solved at once: ``u`` = log speed, observed by the road, tied from step to step by the ratios of
-    lengths and, weakly, by what a car can accelerate; all robust. The depth of the scene anchors what no road does.
+    lengths or, where there are none, by what a car can accelerate; all robust. The depth of the scene anchors what no road does.
     """
     count = len(moving)
     seen = np.isfinite(evidence.road_sigma) & moving
@@ -108,7 +108,7 @@ def _solve_stretch(
             robust_road * road + depth_weight * depth,
             robust_tie[1:],
             change[1:],
-            1.0 / gain[1:] ** 2,
+            np.where(tied[1:], 0.0, 1.0 / gain[1:] ** 2),
         )
     drift = np.where(robust_tie > 0, walk, gain)
     return logs, np.sqrt(_variance(robust_road, drift, depth_sigma**2))

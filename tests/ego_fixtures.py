@@ -78,7 +78,8 @@ def tracks_of(
         frames.append(
             FrameTracks(
                 ids=ids[order], points_px=noisy.astype(np.float32),
-                forward_backward_px=np.full(len(ids), noise_px, np.float32), cut=False, repeated=False, grey_level=120.0,
+                forward_backward_px=np.full(len(ids), noise_px, np.float32), cut=False, repeated=False,
+                grey_level=120.0,
             )
         )  # fmt: skip
     return RunTracks(
@@ -92,7 +93,7 @@ def _points(rng: np.random.Generator, cam_to_world: np.ndarray, scene: str, heig
     if scene == "wall":
         return np.stack([rng.uniform(-30, 30, 4000), rng.uniform(-20, 20, 4000), np.full(4000, 30.0)], axis=1)
     low, high = path.min(axis=0) - 90, path.max(axis=0) + 90
-    count = int(min(60_000, 1.2 * (high[0] - low[0]) * (high[2] - low[2])))
+    count = int(min(25_000, 0.5 * (high[0] - low[0]) * (high[2] - low[2])))
     ground = rng.uniform(low, high, (count, 3))
     near = path[:: max(1, len(path) // 40)]
     close = np.concatenate([ground, (near[:, None] + rng.uniform(-9, 9, (len(near), 60, 3))).reshape(-1, 3)])
@@ -114,11 +115,10 @@ def _topped_up(
     order = np.concatenate([alive, fresh])
     cell = (pixel[order] // 32).astype(int)
     index = cell[:, 1] * 100 + cell[:, 0]
-    rank = np.zeros(len(order), int)
-    held: dict[int, int] = {}
-    for at, key in enumerate(index.tolist()):
-        rank[at] = held.get(key, 0)
-        held[key] = rank[at] + 1
+    by_cell = np.argsort(index, kind="stable")
+    sorted_index = index[by_cell]
+    rank = np.empty(len(order), int)
+    rank[by_cell] = np.arange(len(order)) - np.searchsorted(sorted_index, sorted_index)
     good = order[(rank < 2) | (np.arange(len(order)) < len(alive))]
     return np.sort(good[:corners])
 
