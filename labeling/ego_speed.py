@@ -44,7 +44,8 @@ def run_speeds(
     """Smooth log speeds over every stretch of moving steps; 0 elsewhere.
 
     A stretch is solved at once: ``u`` = log speed, observed by the road, tied from step to step by the ratios of
-    lengths or, where there are none, by what a car can accelerate; all robust. The depth of the scene anchors what no road does.
+    lengths or, where there are none, by what a car can accelerate; all robust. The depth of the scene anchors what no
+    road does.
     """
     count = len(moving)
     seen = np.isfinite(evidence.road_sigma) & moving
