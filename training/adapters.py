@@ -160,13 +160,14 @@ def adapter_bytes(
 
 
 def read_adapter(path: Path) -> AdapterFile:
-    """An adapter file: ours, diffusers', PEFT's, ComfyUI's or the released ones.
+    """An adapter file: ours, diffusers', PEFT's, ComfyUI's or the released ones; or the folder that training wrote.
 
     Alpha comes from the metadata, else from ``.alpha`` tensors, else it equals the rank.
 
     Raises:
         ModelError: missing, not safetensors, or without a LoRA in it.
     """
+    path = path / "adapter.safetensors" if path.is_dir() else path
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
