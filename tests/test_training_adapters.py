@@ -142,6 +142,8 @@ def test_alpha_tensors_are_honoured(tmp_path: Path) -> None:
     lora |= {f"{module}.alpha": torch.tensor(2.0) for module in modules}
     save_file({f"transformer.{key}": tensor for key, tensor in lora.items()}, tmp_path / "a.safetensors")
     assert read_adapter(tmp_path / "a.safetensors").alpha == 2
+    (tmp_path / "a.safetensors").rename(tmp_path / "adapter.safetensors")
+    assert read_adapter(tmp_path).alpha == 2, "the folder that training wrote stands for the adapter in it"
 
 
 def test_only_the_adapter_is_trainable_and_in_float32() -> None:
