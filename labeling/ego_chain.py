@@ -76,6 +76,7 @@ def length_evidence(
     moving: np.ndarray,
     pitch_rad: float,
 ) -> LengthEvidence:
+    """What the road, the scene's depth and the steps' neighbours say of each step's length, one entry a frame."""
     count = len(steps)
     elapsed = np.diff(times, prepend=times[0])
     heights, road_sigma = np.zeros(count), np.full(count, np.inf)

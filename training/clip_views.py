@@ -126,6 +126,7 @@ def frame_indices(clip_frames: int, picture: PictureConfig) -> np.ndarray:
 
 
 def resized(frames: np.ndarray, width: int, height: int, *, nearest: bool = False) -> np.ndarray:
+    """(T, height, width, 3) uint8 from (T, H, W, 3): by area, or by the nearest pixel where colours must stay exact."""
     if frames.shape[1:3] == (height, width):
         return frames
     method = cv2.INTER_NEAREST if nearest else cv2.INTER_AREA
