@@ -28,7 +28,7 @@ from training.street_scores import distance_to_curve
 from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses, grid_cells
 
 WIDTH, HEIGHT = 256, 192
-FLOORS = {"car_recall": 0.75, "car_pck10": 0.7, "lane_recall": 0.7}
+FLOORS = {"car_recall": 0.85, "car_pck10": 0.8, "lane_recall": 0.8}
 """Well under the figures in the cards, which more frames gave: the test tells a broken model from a good one."""
 
 
@@ -196,9 +196,7 @@ def test_the_detector_loss_is_least_for_the_truth() -> None:
     rows[0, mine, 4], rows[0, mine, 6] = 8.0, 8.0
 
     def loss(values: torch.Tensor) -> float:
-        return float(
-            detector_loss(values, torch.from_numpy(targets.classes)[None], truth[None], cells, strides, torch.ones(2))
-        )
+        return float(detector_loss(values, torch.from_numpy(targets.classes)[None], truth[None], cells, strides))
 
     best = loss(rows)
     assert best < 0.1

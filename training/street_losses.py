@@ -7,9 +7,7 @@ from torch.nn import functional
 _IGNORED = -2
 
 
-def detector_loss(
-    rows: Tensor, classes: Tensor, boxes_xyxy: Tensor, cells: Tensor, strides: Tensor, weights: Tensor
-) -> Tensor:
+def detector_loss(rows: Tensor, classes: Tensor, boxes_xyxy: Tensor, cells: Tensor, strides: Tensor) -> Tensor:
     """Overlap, objectness and class losses of a grid detector (Ge et al. 2021, with fixed assignment).
 
     Args:
@@ -18,7 +16,6 @@ def detector_loss(
         boxes_xyxy: (N, A, 4) input pixels.
         cells: (A, 2) column and row of each cell.
         strides: (A,) pixels per cell.
-        weights: (C,) of each class.
     """
     positive = classes >= 0
     count = positive.sum().clamp(min=1)
@@ -29,16 +26,12 @@ def detector_loss(
     overlap, generalised = _overlaps(torch.cat([centres - halves, centres + halves], dim=1), truth)
     objectness = torch.zeros_like(rows[..., 4])
     # The overlap is the score that suppression ranks by: the best placed of an object's cells survives.
-    objectness[sample, cell] = overlap.detach().clamp(min=0.25).sqrt()
-    # People are outnumbered ten to one by cars.
-    kinds = torch.ones_like(rows[..., 4])
-    kinds[sample, cell] = weights[classes[sample, cell]]
+    objectness[sample, cell] = overlap.detach().clamp(min=0.3)
     entropy = functional.binary_cross_entropy_with_logits(rows[..., 4], objectness, reduction="none")
-    entropy = (entropy * kinds * (classes != _IGNORED)).sum() / count
+    entropy = (entropy * (classes != _IGNORED)).sum() / count
     names = functional.one_hot(classes[sample, cell], rows.shape[2] - 5).float()
-    naming = functional.binary_cross_entropy_with_logits(picked[:, 5:], names, reduction="none").sum(dim=1)
-    found = weights[classes[sample, cell]] * (3 * (1 - generalised) + 0.5 * naming)
-    return entropy + found.sum() / count
+    naming = functional.binary_cross_entropy_with_logits(picked[:, 5:], names, reduction="sum") / count
+    return 3 * (1 - generalised).sum() / count + entropy + 0.5 * naming
 
 
 def _overlaps(boxes: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,6 @@ from labeling.fields import FieldModel
 from labeling.keypoints import KeypointHead
 from labeling.model_cards import SHIPPED_CARDS, CifcafCard, FieldHeadCard, ModelCard, SimccCard, YoloxCard, read_card
 from labeling.model_cards import write_card as write_model_card
-from labeling.schemas import Category
 from training.street_augment import AugmentSettings
 from training.street_batches import CLASSES, Batch, CropBatches, DetectorBatches, FieldBatches
 from training.street_export import export_model
@@ -45,17 +44,18 @@ ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
 WORKERS = 2
 """Processes that render and train."""
-TRAIN_SEED, HELD_OUT_SEED = 20_000, 90_000
-"""First street seed of either set; no street is in both."""
+TRAIN_SEED, HELD_OUT_SEED = 20_000, 95_000
+"""First street seed of either set; no street is in both. Thresholds were chosen on seeds from 90,000, in neither."""
 PLANNED: tuple[Scenario, ...] = (
     "drive", "traffic", "crossing", "stop_and_go", "parked", "traffic", "turn", "cross_traffic", "drive", "crossing",
     "traffic", "lead_leaves", "parked", "fast", "sharp_turn", "reverse", "empty", "wall", "road_only", "still",
 )  # fmt: skip
 """Scenarios in turn; busy ones come more often."""
 _WINDOW = (352, 256)
-_CLASS_WEIGHTS: dict[Category, float] = {"car": 1.0, "person": 2.5}
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
 _FIELD_SIZE = (529, 353)
+_VOTES = {"gain": 3.0, "shift": 1.5, "widen": 1.4}
+"""Chosen, as the thresholds, for the decoder's own constants: counts of lanes exact in 78 % of frames against 20 %."""
 _LICENCE = "Apache-2.0"
 _SOURCE = "ships with Animatic; `make street-models` trains and exports it again from seeds"
 
@@ -112,22 +112,21 @@ def _steps(count: int, share: float) -> int:
 
 def _detector_recipe(seed: int, share: float) -> Recipe:
     cells, strides = (torch.from_numpy(array) for array in grid_cells(*_WINDOW))
-    weights = torch.tensor([_CLASS_WEIGHTS[name] for name in CLASSES])
 
     def loss(network: nn.Module, batch: Batch) -> torch.Tensor:
         classes, boxes = batch.targets
-        return detector_loss(network(batch.pictures).float(), classes, boxes, cells, strides, weights)
+        return detector_loss(network(batch.pictures).float(), classes, boxes, cells, strides)
 
     card = YoloxCard(
         name="street_detector", file="street_detector.onnx", licence=_LICENCE, source=_SOURCE, classes=CLASSES,
         categories={name: name for name in CLASSES}, input_width=PICTURE_SIZE[0], input_height=PICTURE_SIZE[1],
-        score_threshold=0.3, nms_threshold=0.45,
+        score_threshold=0.35, nms_threshold=0.45,
     )  # fmt: skip
     return Recipe(
         card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph,
         batches=lambda pool: DetectorBatches(pool=pool, size=_WINDOW, count=16, augment=AugmentSettings()),
         loss=loss,
-        fit=FitSettings(name=card.name, seed=seed, steps=_steps(3200, share), learning_rate=3e-3),
+        fit=FitSettings(name=card.name, seed=seed, steps=_steps(2400, share)),
     )  # fmt: skip
 
 
@@ -154,7 +153,7 @@ def _head_recipe(name: str, schema: str, seed: int, share: float) -> Recipe:
 
 
 def _field_recipe(name: str, schemas: tuple[str, ...], seed: int, share: float) -> Recipe:
-    lane = {"point_threshold": 0.3, "instance_threshold": 0.2, "min_points": 4}
+    lane = {"point_threshold": 0.3, "instance_threshold": 0.28, "min_points": 4}
     heads = [
         {"schema": schema, "cif": f"{schema}_cif", "caf": f"{schema}_caf", **(lane if schema == "lane24" else {})}
         for schema in schemas
@@ -173,11 +172,11 @@ def _field_recipe(name: str, schemas: tuple[str, ...], seed: int, share: float) 
 
     return Recipe(
         card=card, network=lambda: FieldNetwork(schemas), loss=loss,
-        graph=lambda network: FieldGraph(network, columns=columns, rows=rows),
+        graph=lambda network: FieldGraph(network, columns=columns, rows=rows, **_VOTES),
         batches=lambda pool: FieldBatches(
             pool=pool, schemas=schemas, size=_FIELD_SIZE, count=8, augment=AugmentSettings()
         ),
-        fit=FitSettings(name=name, seed=seed, steps=_steps(2000, share)),
+        fit=FitSettings(name=name, seed=seed, steps=_steps(1400, share)),
     )  # fmt: skip
 
 

@@ -187,13 +187,26 @@ class FieldNetwork(nn.Module):
 
 
 class FieldGraph(nn.Module):
-    """``FieldNetwork`` as the ``cifcaf`` contract wants it, for a fixed field size."""
+    """``FieldNetwork`` as the ``cifcaf`` contract wants it, for a fixed field size.
+
+    Nothing marks a lane's points, so their cells' confidences are honest but modest, and the decoder adds and
+    multiplies them up: ``gain`` and ``shift`` sharpen their logits, ``widen`` the points' scales.
+    """
 
     offsets: torch.Tensor
 
-    def __init__(self, network: FieldNetwork, *, columns: int, rows: int) -> None:
+    def __init__(
+        self,
+        network: FieldNetwork,
+        *,
+        columns: int,
+        rows: int,
+        gain: float = 1.0,
+        shift: float = 0.0,
+        widen: float = 1.0,
+    ) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.gain, self.shift, self.widen = network, gain, shift, widen
         y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
         self.register_buffer("offsets", torch.stack([x, y]).float()[None, None])
 
@@ -201,11 +214,11 @@ class FieldGraph(nn.Module):
         """``cif`` (N, K, 5, h, w) and ``caf`` (N, E, 8, h, w), one pair after the other; units are cells."""
         outputs = []
         for cif, caf in self.network(pictures):
-            confidence = cif[:, :, :1].sigmoid()
-            scale = cif[:, :, 3:].clamp(max=_MAX_LOG_SIZE).exp()
+            confidence = (self.gain * cif[:, :, :1] + self.shift).sigmoid()
+            scale = self.widen * cif[:, :, 3:].clamp(max=_MAX_LOG_SIZE).exp()
             outputs.append(torch.cat([confidence * 0, confidence, cif[:, :, 1:3] + self.offsets, scale], dim=2))
-            confidence = caf[:, :, :1].sigmoid()
+            confidence = (self.gain * caf[:, :, :1] + self.shift).sigmoid()
             ends = [caf[:, :, 1:3] + self.offsets, caf[:, :, 3:5] + self.offsets]
-            scale = caf[:, :, 5:].clamp(max=_MAX_LOG_SIZE).exp()
+            scale = self.widen * caf[:, :, 5:].clamp(max=_MAX_LOG_SIZE).exp()
             outputs.append(torch.cat([confidence * 0, confidence, *ends, scale], dim=2))
         return outputs

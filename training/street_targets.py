@@ -8,15 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labeling.schemas import Category, KeypointSchema
+from labeling.schemas import KeypointSchema
 from training.street_networks import DETECTOR_STRIDES
 
 LEVEL_LIMITS_PX = (0.0, 40.0, 88.0, np.inf)
 """Root of the box area from which each stride of the detector is responsible, input pixels."""
 _CENTRE_RADIUS = 1.0
-FIELD_WINDOWS: dict[Category, int] = {"car": 4, "person": 4, "lane": 6}
-"""Cells along each side of the square that votes for a point. 16 sure votes of c / 16 make a whole one; a lane's votes
-are never sure, since nothing marks its points."""
+_FIELD_WINDOW = 4
+"""Cells along each side of the square that votes for a point: 16 votes of c / 16 make a whole one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,16 +130,16 @@ def encode_fields(
     cif, caf = [np.zeros((0, 7))], [np.zeros((0, 10))]
     for rank, (points, present, scales) in enumerate(objects):
         cells, log_scales = points / stride, np.log(np.maximum(scales / stride, 1e-3))
-        cif.append(_point_votes(cells, present, log_scales, FIELD_WINDOWS[table.category]))
+        cif.append(_point_votes(cells, present, log_scales))
         caf.append(_edge_votes(cells, edges[present[edges].all(axis=1)], edges, log_scales, rank))
     return FieldTargets(cif=_settle(np.concatenate(cif), shape), caf=_settle(np.concatenate(caf), shape))
 
 
-def _point_votes(cells_xy: np.ndarray, present: np.ndarray, log_scales: np.ndarray, side: int) -> np.ndarray:
+def _point_votes(cells_xy: np.ndarray, present: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
     """(V, 7) votes of the cells around each point: cost, field, x, y, then offset x and y and log scale."""
-    window = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=2).reshape(-1, 2)
+    window = np.stack(np.meshgrid(np.arange(_FIELD_WINDOW), np.arange(_FIELD_WINDOW)), axis=2).reshape(-1, 2)
     chosen = np.flatnonzero(present)
-    corners = np.floor(cells_xy[chosen] - (side / 2 - 1))
+    corners = np.floor(cells_xy[chosen] - (_FIELD_WINDOW / 2 - 1))
     places = corners[:, None] + window
     offsets = cells_xy[chosen, None] - places
     # Two objects' points share cells: each cell votes for the nearer.
