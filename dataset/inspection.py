@@ -85,6 +85,8 @@ def summarize(job: Path) -> Summary:
     Raises:
         DataError: the folder holds no selection yet.
     """
+    if not (job / "selection.parquet").is_file():
+        raise DataError(f"{job}: holds no selection; make one with `animatic label VIDEO... --out {job}`")
     selection = read_selection(job / "selection.parquet")
     receipts = {stage: read_receipts(job, stage) for stage in ("index", "count", "cut", "keypoints", "ego", "render")}
     index_file = job / "shards" / "index.parquet"

@@ -106,6 +106,8 @@ def read_table(path: Path, schema: pa.Schema) -> tuple[pa.Table, dict[str, Any]]
     Raises:
         DataError: the file is missing, no Parquet, or has other columns than ``schema``.
     """
+    if not path.is_file():
+        raise DataError(f"{path}: is not there; name the job's folder, or run the stage that writes this table")
     try:
         table = pq.read_table(path, use_threads=False)
     except (OSError, pa.ArrowException) as error:
