@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 _LK_TERMINATION = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 12, 0.02)
 _THUMBNAIL = (64, 36)
+_LEAST_CORNERS = 20
 
 
 class TrackSettings(BaseModel):
@@ -63,6 +64,7 @@ class CornerTracker:
         self._points = np.zeros((0, 2), np.float32)
         self._flow = np.zeros((0, 2), np.float32)
         self._next_id = 0
+        self._usual_change = 3.0
         self._cell = max(8, round(np.sqrt(2.0 * self.width * self.height / settings.corners)))
 
     def step(self, picture: np.ndarray, boxes_xyxy: np.ndarray, *, restart: bool, repeated: bool) -> FrameTracks:
@@ -80,17 +82,30 @@ class CornerTracker:
         if self._previous is not None and not restart and len(self._ids):
             before = len(self._ids)
             back = self._follow(self._previous, grey, allowed)
-            cut = len(self._ids) < 0.2 * before and _histogram_jumps(thumbnail, self._thumbnail)
+            lost = before >= _LEAST_CORNERS and len(self._ids) < 0.2 * before
+            cut = lost and self._scene_changes(thumbnail)
         if cut:
-            self._keep(np.zeros(len(self._ids), bool))
-            back = np.zeros(0, np.float32)
+            back = self._forget()
         added = self._replenish(grey, allowed)
+        # What shows nothing is no new scene: the old one may come back.
+        cut = restart or (cut and added >= _LEAST_CORNERS)
+        change = np.abs(thumbnail.astype(np.int16) - self._thumbnail).mean()
+        self._usual_change += 0.2 * (float(change) - self._usual_change)
         self._previous, self._thumbnail = grey, thumbnail
         return FrameTracks(
             ids=self._ids.copy(), points_px=self._points.copy(),
             forward_backward_px=np.concatenate([back, np.zeros(added, np.float32)]),
             cut=cut, repeated=repeated, grey_level=level,
         )  # fmt: skip
+
+    def _scene_changes(self, thumbnail: np.ndarray) -> bool:
+        """Whether the picture as a whole changes far more than it has of late."""
+        change = np.abs(thumbnail.astype(np.int16) - self._thumbnail).mean()
+        return bool(change > max(6.0, 3.0 * self._usual_change)) or _histogram_jumps(thumbnail, self._thumbnail)
+
+    def _forget(self) -> np.ndarray:
+        self._keep(np.zeros(len(self._ids), bool))
+        return np.zeros(0, np.float32)
 
     def _grey(self, picture: np.ndarray) -> np.ndarray:
         size = (self.width, self.height)

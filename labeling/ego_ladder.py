@@ -97,7 +97,7 @@ def explain_pair(
     turn = _turn(corners, rotation, noise_floor)
     prior = (axis, axis_sigma)
     fit = _moving(corners, [(rotation, axis), (turn, axis)], noise_floor, prior)
-    if _share(corners, fit, noise_floor) < least_inlier_share:
+    if max(_share(corners, fit, noise_floor), _turning_share(corners, turn, noise_floor)) < least_inlier_share:
         starts = [*five_point(first, second, noise_floor), *plane_motions(first, second, noise_floor)]
         fit = _moving(corners, starts, noise_floor, prior, rival=fit)
     rotation, axis, information = _without_traffic(corners, fit, noise_floor, prior)
@@ -159,11 +159,15 @@ def _turn(corners: Corners, rotation: np.ndarray, noise: float) -> np.ndarray:
     found, most = rotation, -0.05
     for start in (15.0 * noise, widest):
         turn = fit_turning(first, second, weight, rotation, _narrowing(start, noise))
-        near = np.linalg.norm(turning_residuals(first, second, turn), axis=1) < 2.0 * _INLIER * noise
-        share = float((weight * near).mean())
+        share = _turning_share(corners, turn, noise)
         if share > most + 0.05:
             found, most = turn, share
     return found
+
+
+def _turning_share(corners: Corners, rotation: np.ndarray, noise: float) -> float:
+    distance = np.linalg.norm(turning_residuals(corners.first, corners.second, rotation), axis=1)
+    return float((corners.weight * (distance < 2.0 * _INLIER * noise)).mean())
 
 
 def _moving(

@@ -20,6 +20,7 @@ FORWARD = np.array([0.0, 0.0, -1.0])
 """Translation of ``x2 = R x1 + t`` of a camera that moves along its axis: the scene comes nearer."""
 _WIDEST_AXIS = 0.35
 _OVERLAY_CELL = 16
+_DOUBT_GAIN = 0.35
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,6 +99,8 @@ class StepSolver:
         self._focal, self._centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
         self._floor = settings.noise_px / camera.fx
         self._kept, self._times = shown_frames(tracks)
+        self._all_ids = np.unique(np.concatenate([frame.ids for frame in tracks.frames]))
+        self._doubt = np.zeros(len(self._all_ids))
         self._overlay = overlay_cells(tracks, self._kept, horizon_px=camera.cy, focal_px=camera.fx)
 
     @property
@@ -127,13 +130,23 @@ class StepSolver:
             rotation = (np.eye(3), pair.turn, pair.rotation)[best]
             if best == 2 and pair.axis_sigma < _WIDEST_AXIS:
                 axis, axis_sigma = pair.axis, pair.axis_sigma
+            if best == 2:
+                self._remember(corners, pair)
             steps[index] = Step(corners=corners, pair=pair, window=None, window_corners=None, window_s=elapsed)
         return [self._widened(steps, cuts, index) for index in range(count)], cuts
 
-    def _explain(self, corners: Corners, rotation: np.ndarray, axis: np.ndarray, axis_sigma: float) -> PairMotion:
+    def _remember(self, corners: Corners, pair: PairMotion) -> None:
+        """Doubt corners that would not fit: what moved by itself a moment ago will again."""
+        if pair.inlier_shares[2] > 0.5:
+            at = np.searchsorted(self._all_ids, corners.ids)
+            self._doubt[at] += _DOUBT_GAIN * (~pair.inlier - self._doubt[at])
+
+    def _explain(
+        self, corners: Corners, rotation: np.ndarray, axis: np.ndarray, axis_sigma: float, *, restarts: bool = True
+    ) -> PairMotion:
         return explain_pair(
             corners, rotation=rotation, axis=axis, axis_sigma=axis_sigma, noise_floor=self._floor,
-            least_inlier_share=self._settings.least_inlier_share,
+            least_inlier_share=self._settings.least_inlier_share if restarts else 0.0,
         )  # fmt: skip
 
     def _widened(self, steps: list[Step | None], cuts: np.ndarray, index: int) -> Step | None:
@@ -163,10 +176,10 @@ class StepSolver:
             rotation = turn @ rotation
             if place > len(turns) // 2:
                 half_turn = turn @ half_turn
-        window = self._explain(corners, rotation, half_turn @ step.pair.axis, 3 * _WIDEST_AXIS)
+        window = self._explain(corners, rotation, half_turn @ step.pair.axis, 3 * _WIDEST_AXIS, restarts=False)
         # The chord's direction in the last frame, turned back to the frame that this step ends in.
         axis = half_turn.T @ window.axis
-        pair = self._explain(step.corners, turns[len(turns) // 2], axis, max(window.axis_sigma, 2e-3))
+        pair = self._explain(step.corners, turns[len(turns) // 2], axis, max(window.axis_sigma, 2e-3), restarts=False)
         return Step(
             corners=step.corners, pair=pair, window=window, window_corners=corners,
             window_s=float(self._times[span[1]] - self._times[span[0]]),
@@ -180,11 +193,12 @@ class StepSolver:
             one, two = one[scene], two[scene]
         if len(one) < self._settings.least_corners:
             return None
+        doubt = self._doubt[np.searchsorted(self._all_ids, after.ids[two])]
         return Corners(
             ids=after.ids[two],
             first=(before.points_px[one] - self._centre) / self._focal,
             second=(after.points_px[two] - self._centre) / self._focal,
-            weight=_balanced(after, two, self._tracks),
+            weight=_balanced(after, two, self._tracks) * np.maximum((1.0 - doubt) ** 2, 0.02),
         )
 
 
