@@ -4,8 +4,9 @@ Judged are objects at least 32 px high of which at least 30 % is visible; others
 object that was missed counts as wrong.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -34,6 +35,20 @@ class StreetModels:
     fields: FieldModel | None = None
 
 
+class BoxTruth(Protocol):
+    """What an object must tell to be judged: ``ObjectTruth`` and ``dataset.street_labels.StreetObject`` do."""
+
+    @property
+    def box_xyxy(self) -> np.ndarray:
+        """(4,) of what is visible."""
+        ...
+
+    @property
+    def visible_share(self) -> float:
+        """0 to 1."""
+        ...
+
+
 @dataclass(slots=True)
 class Tally:
     """Sums over frames; ``figures`` gives the shares."""
@@ -49,7 +64,7 @@ class Tally:
         return {name: round(float(np.mean(values)), 4) for name, values in sorted(self.hits.items()) if values}
 
 
-def is_judged(truth: ObjectTruth) -> bool:
+def is_judged(truth: BoxTruth) -> bool:
     """High and visible enough to be asked for."""
     return bool(truth.box_xyxy[3] - truth.box_xyxy[1] >= JUDGED_HEIGHT_PX and truth.visible_share >= JUDGED_SHARE)
 
@@ -62,11 +77,11 @@ def judge_frame(models: StreetModels, rgb: np.ndarray, truths: tuple[ObjectTruth
         for category in ("car", "person"):
             mine = tuple(truth for truth in truths if truth.category == category)
             seen = found.select(found.categories == category)
-            partner, phantoms = match_boxes(seen, mine)
+            partner, phantoms = match_boxes(seen.boxes_xyxy, mine)
             wanted = [index for index, truth in enumerate(mine) if is_judged(truth)]
             tally.add(f"{category}_recall", [partner[index] >= 0 for index in wanted])
-            tally.add(f"{category}_phantoms_per_frame", [phantoms])
-            exact &= phantoms == 0 and all(partner[index] >= 0 for index in wanted)
+            tally.add(f"{category}_phantoms_per_frame", [len(phantoms)])
+            exact &= not len(phantoms) and all(partner[index] >= 0 for index in wanted)
             if category in models.heads:
                 _judge_points(models.heads[category], rgb, seen, [mine[i] for i in wanted], partner[wanted], tally)
         tally.add("count_exact", [exact])
@@ -76,31 +91,46 @@ def judge_frame(models: StreetModels, rgb: np.ndarray, truths: tuple[ObjectTruth
         _judge_lanes(found_lanes, lanes, tally)
 
 
-def match_boxes(found: Detections, truths: tuple[ObjectTruth, ...]) -> tuple[np.ndarray, int]:
-    """Greedy one-to-one matches, best detection first.
+def match_boxes(boxes_xyxy: np.ndarray, truths: Sequence[BoxTruth]) -> tuple[np.ndarray, np.ndarray]:
+    """Greedy one-to-one matches, in the order given: best first.
+
+    Args:
+        boxes_xyxy: (m, 4) what was found.
+        truths: n objects, judged or not.
 
     Returns:
-        (n,) the detection of each truth or -1, and the number of detections, high enough to be judged, that match
-        nothing and do not lie on an object that is not judged.
+        (n,) the box of each truth or -1; and the indices of phantoms: boxes high enough to be judged that match nothing
+        and do not lie on an object that is not judged.
     """
     partner = np.full(len(truths), -1)
-    phantoms = 0
+    phantoms = []
     boxes = np.array([truth.box_xyxy for truth in truths]).reshape(-1, 4)
-    for index, box in enumerate(found.boxes_xyxy):
-        overlap, inside = _overlaps(box, boxes)
+    for index, box in enumerate(boxes_xyxy):
+        overlap, inside = box_overlaps(box, boxes)
         overlap[partner >= 0] = 0
         best = int(overlap.argmax()) if len(overlap) else -1
         if best >= 0 and overlap[best] >= _MATCH_IOU:
             partner[best] = index
-        else:
-            excused = [
-                not is_judged(truth) and share > _EXCUSED_SHARE for truth, share in zip(truths, inside, strict=True)
-            ]
-            phantoms += bool(box[3] - box[1] >= JUDGED_HEIGHT_PX) and not any(excused)
-    return partner, phantoms
+        elif not is_excused(box, truths, inside):
+            phantoms.append(index)
+    return partner, np.array(phantoms, np.int64)
 
 
-def _overlaps(box: np.ndarray, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def is_excused(box_xyxy: np.ndarray, truths: Sequence[BoxTruth], inside: np.ndarray) -> bool:
+    """Whether a box that matches nothing is no mistake: too low, or on an object that is not judged.
+
+    Args:
+        box_xyxy: (4,).
+        truths: n objects.
+        inside: (n,) share of the box that each covers.
+    """
+    if box_xyxy[3] - box_xyxy[1] < JUDGED_HEIGHT_PX:
+        return True
+    return any(not is_judged(truth) and share > _EXCUSED_SHARE for truth, share in zip(truths, inside, strict=True))
+
+
+def box_overlaps(box: np.ndarray, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) IoU of a box (4,) with boxes (n, 4), and (n,) share of it that each covers."""
     sides = np.minimum(boxes[:, 2:], box[2:]) - np.maximum(boxes[:, :2], box[:2])
     shared = np.prod(np.maximum(sides, 0), axis=1)
     area, areas = np.prod(box[2:] - box[:2]), np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
