@@ -242,8 +242,8 @@ def outputs_present(job: Path, receipt: Receipt) -> bool:
     return True
 
 
-def atomic_write(path: Path, data: bytes) -> None:
-    """Write a small file whole or not at all.
+def atomic_write(path: Path, data: bytes | Iterable[bytes]) -> None:
+    """Write a file whole or not at all, from its bytes or from their pieces in order.
 
     Raises:
         StorageError: no space, or the folder cannot be written to.
@@ -253,11 +253,12 @@ def atomic_write(path: Path, data: bytes) -> None:
         temporary = path.with_name(f".{path.name}.{host_name()}-{os.getpid()}.tmp")
         try:
             with temporary.open("wb") as stream:
-                stream.write(data)
+                for piece in (data,) if isinstance(data, bytes) else data:
+                    stream.write(piece)
                 stream.flush()
                 os.fsync(stream.fileno())
             temporary.replace(path)
-        except OSError:
+        except BaseException:
             with contextlib.suppress(OSError):
                 temporary.unlink()
             raise

@@ -249,13 +249,13 @@ def check_model(
     raise typer.Exit(print_check(card, image or [], models_dir=models, as_json=as_json))
 
 
-export_app = typer.Typer(help="Write a packed job in other forms.", no_args_is_help=True)
+export_app = typer.Typer(help="Write a job in other forms.", no_args_is_help=True)
 app.add_typer(export_app, name="export", rich_help_panel=LOOK)
 
 
 @export_app.callback()
 def _export() -> None:
-    """Write a packed job in other forms."""
+    """Write a job in other forms."""
 
 
 @export_app.command("released")
@@ -268,6 +268,19 @@ def export_released(
     from pipelines.export import export_released as export
 
     raise typer.Exit(export(job, out, split=split))
+
+
+@export_app.command("coco")
+def export_coco(
+    job: JobFolder,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the JSON file and its images.")],
+    split: Annotated[str, typer.Option(help="train or val.")] = "train",
+    images: Annotated[bool, typer.Option("--images", help="Write the frames as JPEG files too.")] = False,
+) -> None:
+    """Keypoints, boxes and tracks as COCO JSON."""
+    from pipelines.export_coco import export_coco as export
+
+    raise typer.Exit(export(job, out, split=split, images=images))
 
 
 app.add_typer(training_commands)

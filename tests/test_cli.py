@@ -116,6 +116,13 @@ def test_the_released_trainer_s_manifest(run, job, tmp_path):
     assert run("export", "released", job, "--out", tmp_path, "--split", "val")[0] == 2
 
 
+def test_keypoints_as_coco(run, job, tmp_path):
+    code, out, _ = run("export", "coco", job, "--out", tmp_path)
+    found = json.loads((tmp_path / "train.coco.json").read_text())
+    assert code == 0 and "17 images of 1 runs" in out and len(found["images"]) == 17
+    assert run("export", "coco", job, "--out", tmp_path, "--split", "val")[0] == 2
+
+
 def test_the_report_stands_alone(run, job):
     code, out, _ = run("report", job)
     page = (job / "report.html").read_text()
