@@ -5,7 +5,7 @@ identity; ``se3`` and ``sim3`` first fit one onto the other (Umeyama 1991), whic
 every figure names its alignment. Lengths that differ are an error: nothing is resampled behind the caller's back.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
@@ -160,6 +160,33 @@ def mean_interval(values: Sequence[float], groups: Sequence[str], *, draws: int 
     means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
     low, high = np.percentile(means, [2.5, 97.5]) if len(names) > 1 else (np.min(values), np.max(values))
     return Interval(mean=float(np.mean(values)), low=float(low), high=float(high), groups=len(names))
+
+
+def paired_interval(
+    first: Mapping[str, float],
+    second: Mapping[str, float],
+    groups: Mapping[str, str],
+    *,
+    draws: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """Mean of ``second - first`` over what both have, with its 95 % interval: pairs cancel what is common to them.
+
+    Args:
+        first: value by key (a clip, a seed).
+        second: the same for the other method; NaN counts as not there.
+        groups: the source video of each key.
+        draws: bootstrap draws.
+        seed: of the draws.
+
+    Raises:
+        DataError: no key has both values.
+    """
+    both = sorted(key for key in first if key in second and np.isfinite(first[key]) and np.isfinite(second[key]))
+    if not both:
+        raise DataError("no key has a value on both sides, so there is nothing to compare; evaluate the same clips")
+    differences = [second[key] - first[key] for key in both]
+    return mean_interval(differences, [groups[key] for key in both], draws=draws, seed=seed)
 
 
 def pck(predicted: np.ndarray, truth: np.ndarray, box_xyxy: np.ndarray, *, threshold: float = 0.1) -> tuple[int, int]:
