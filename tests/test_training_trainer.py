@@ -13,7 +13,7 @@ from training_fixtures import PICTURE, in_children, one_thread, tiny_config, tin
 from labeling.errors import ConfigError, DataError
 from training.adapters import activate_adapter
 from training.backbones import load_backbone
-from training.batches import StepBatches, TrainingItems, collate
+from training.batches import Draw, StepBatches, TrainingItems, collate
 from training.checkpoints import list_checkpoints, newest_checkpoint, save_checkpoint
 from training.config import TrainConfig
 from training.guards import TrainingError, memory_knobs
@@ -61,10 +61,14 @@ def test_the_loss_falls_and_the_adapter_is_what_was_trained(stage, tiny_job: Pat
     assert float(torch.stack(losses).mean()) == pytest.approx(held_out[1], rel=1e-5)
 
 
-def test_kill_9_and_resume_equals_an_undisturbed_run_bit_for_bit(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+@pytest.mark.parametrize("workers", [0, 2], ids=["no workers", "2 workers"])
+def test_kill_9_and_resume_equals_an_undisturbed_run_bit_for_bit(
+    workers: int, tiny_job: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
     config = tiny_config(
-        "motion", optimiser={"steps": 6, "schedule": "cosine"}, checkpoint={"every_steps": 3}, adapter={"dropout": 0.1}
-    )
+        "motion", optimiser={"steps": 6, "schedule": "cosine"}, checkpoint={"every_steps": 3}, adapter={"dropout": 0.1},
+        loader_workers=workers,
+    )  # fmt: skip
     whole, broken = tmp_path / "whole", tmp_path / "broken"
 
     def undisturbed(_: int) -> list[float]:
@@ -142,6 +146,26 @@ def test_ctrl_c_saves_first_and_the_run_goes_on(tiny_job: Path, tmp_path: Path) 
     assert cut.interrupted and cut.steps == 2
     rest = run(config, tiny_job, tmp_path / "cut")
     assert (*cut.losses, *rest.losses) == whole.losses
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "terminated"])
+def test_a_signal_to_the_whole_group_lets_the_step_end_first(number, tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    """A terminal interrupts loader workers too, whose batches the step still needs."""
+    config = tiny_config(
+        "motion", optimiser={"steps": 40, "global_batch": 8, "micro_batch": 1}, checkpoint={"every_steps": 100},
+        loader_workers=2,
+    )  # fmt: skip
+
+    def interrupted(_: int) -> tuple[int, bool]:
+        os.setpgrp()
+        summary = run(
+            config, tiny_job, tmp_path,
+            on_step=lambda step, _: os.killpg(0, number) if step == 1 else None,
+        )  # fmt: skip
+        return summary.steps, summary.interrupted
+
+    assert in_children(1, interrupted) == [(2, True)]
+    assert newest_checkpoint(tmp_path / "checkpoints") == tmp_path / "checkpoints" / "step_00000002"
 
 
 def test_a_loss_that_is_no_number_stops_with_the_last_checkpoint_intact(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
@@ -333,3 +357,37 @@ def test_bfloat16_base_trains_float32_adapters(tmp_path: Path) -> None:
     frozen = [one for one in trainer.backbone.denoiser.parameters() if not one.requires_grad]
     assert {one.dtype for one in frozen} == {torch.bfloat16}
     assert losses[-1] < losses[0]
+
+
+def test_fetching_ahead_keeps_order_state_and_errors() -> None:
+    from torchdata.stateful_dataloader import StatefulDataLoader
+
+    from training.prefetch import Prefetched
+
+    config = tiny_config("motion", optimiser={"steps": 6, "global_batch": 2, "micro_batch": 1})
+
+    class Numbers(torch.utils.data.Dataset):
+        def __getitem__(self, draw: Draw) -> tuple[int, int]:
+            if draw.step == 5:
+                raise DataError("clip 5 is damaged")
+            return draw.step, draw.index
+
+        def __len__(self) -> int:
+            return 7
+
+    def loader() -> StatefulDataLoader:
+        batches = StepBatches(7, config=config)
+        return StatefulDataLoader(Numbers(), batch_sampler=batches, collate_fn=lambda items: items[0])
+
+    with Prefetched(loader()) as ahead:
+        seen = [next(ahead) for _ in range(4)]
+        state = ahead.state
+    again = loader()
+    again.load_state_dict(state)
+    with Prefetched(again) as rest:
+        seen += [next(rest) for _ in range(6)]
+        assert [step for step, _ in seen] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+        with pytest.raises(DataError, match="damaged"):
+            next(rest)
+        with pytest.raises(StopIteration):
+            next(rest)

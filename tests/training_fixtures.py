@@ -3,8 +3,10 @@
 import multiprocessing
 import os
 import socket
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -97,8 +99,8 @@ def tiny_config(stage: Any, **overrides: Any) -> TrainConfig:
     return load_config("tiny", stage=stage, overrides=tree)
 
 
-def in_children(count: int, body: Callable[[int], Any], *, timeout_s: float = 120) -> list[Any]:
-    """Results of ``body(rank)`` in forked processes that see each other as torchrun's do; None for the killed.
+def in_children(count: int, body: Callable[[int], Any], *, timeout_s: float = 90) -> list[Any]:
+    """Results of ``body(rank)`` in forked processes that see each other as torchrun's do; None for those that fell.
 
     Forked and not spawned: importing the libraries takes longer than the tests.
     """
@@ -124,14 +126,16 @@ def in_children(count: int, body: Callable[[int], Any], *, timeout_s: float = 12
     children = [context.Process(target=run, args=(rank,)) for rank in range(count)]
     for child in children:
         child.start()
-    found: dict[int, Any] = {}
-    for child in children:
-        child.join(timeout_s)
-        if child.is_alive():
-            child.kill()
-        while not results.empty():
-            rank, value = results.get()
-            found[rank] = value
+    deadline, found = time.monotonic() + timeout_s, {}
+    while any(child.is_alive() for child in children):
+        # One that fell leaves the others waiting for it.
+        if time.monotonic() > deadline or any(child.exitcode not in (None, 0) for child in children):
+            for child in children:
+                child.kill()
+        wait([child.sentinel for child in children if child.is_alive()], timeout=0.5)
+    while len(found) < sum(child.exitcode == 0 for child in children):
+        rank, value = results.get(timeout=5)
+        found[rank] = value
     return [found.get(rank) for rank in range(count)]
 
 

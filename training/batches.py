@@ -144,7 +144,7 @@ class TrainingItems(Dataset):
         clip = self._store.record(key)
         variant = int(keyed_uniform(*keyed, "variant") * clip.object_variants)
         tensors = self._store.read(key, [target_name(stage, control=control), *wanted], object_variant=variant)
-        target = tensors.pop(target_name(stage, control=control)).float()
+        target = tensors.pop(target_name(stage, control=control))
         if stage == "appearance" and not held_out and config.targeted_noise.omega_max > 0:
             tensors[control] = self._noised(key, tensors[control].float(), keyed)
         dropped = not held_out and keyed_uniform(*keyed, "caption") < conditions.caption_dropout

@@ -176,7 +176,7 @@ def _read_text(folder: Path, caption: str) -> TextEmbedding:
     path = text_path(folder, caption)
     try:
         with safe_open(path, framework="pt") as file:
-            return TextEmbedding(tokens_LD=file.get_tensor("tokens").float())
+            return TextEmbedding(tokens_LD=file.get_tensor("tokens"))
     except (OSError, SafetensorError) as error:
         raise DataError(f"no embedding of caption {caption!r} in {folder} ({error}); cache again") from error
 

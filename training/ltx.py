@@ -156,6 +156,8 @@ class LtxBackbone(LazyParts):
         self, inputs: StageInputs, target_BCFHW: torch.Tensor, *, noise_BCFHW: torch.Tensor, sigma_B: torch.Tensor
     ) -> torch.Tensor:
         """Flow-matching loss of each sample over the noisy target tokens, (B,) float32."""
+        # Latents travel in the type they are stored in; the sums are float32.
+        target_BCFHW = target_BCFHW.float()
         noisy = interpolate(target_BCFHW, noise_BCFHW, sigma_B)
         predicted, sequence = self.velocity(inputs, noisy, sigma_B=sigma_B, convention="consistent")
         return masked_mse(predicted, pack(velocity_target(target_BCFHW, noise_BCFHW)), sequence.loss_mask_BN)

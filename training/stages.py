@@ -68,18 +68,18 @@ def stage_inputs(
     text_BLD, mask_BL = pad_text([text], length=text_tokens)
     return StageInputs(
         target_shape=target_shape,
-        first_frame_BCFHW=first_frame_CFHW[None, :, :1].float(),
+        first_frame_BCFHW=first_frame_CFHW[None, :, :1],
         references=tuple(
             Reference(
                 name=name,
-                latents_BCFHW=references[name][None].float(),
+                latents_BCFHW=references[name][None],
                 first_latent_frame=IMAGE_LATENT_FRAME if name == IMAGE else 0,
             )
             for name in allowed
             if name in references
         ),
         slots=allowed,
-        text_BLD=text_BLD.float(),
+        text_BLD=text_BLD,
         text_mask_BL=mask_BL,
         fps=fps,
         image_B1D=None if image_1D is None else image_1D[None].float(),

@@ -208,7 +208,7 @@ class SvdBackbone(LazyParts):
         self, inputs: StageInputs, target_BCFHW: torch.Tensor, *, noise_BCFHW: torch.Tensor, sigma_B: torch.Tensor
     ) -> torch.Tensor:
         """EDM's weighted squared error of each sample over all frames, (B,) float32."""
-        sigma = _wide(sigma_B.float())
+        target_BCFHW, sigma = target_BCFHW.float(), _wide(sigma_B.float())
         estimate = self.denoised(inputs, target_BCFHW + sigma * noise_BCFHW, sigma_B=sigma_B)
         weighted = (estimate - target_BCFHW).square() * (sigma**2 + 1) / sigma**2
         return weighted.flatten(1).mean(dim=1)

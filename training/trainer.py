@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from accelerate import Accelerator
@@ -30,6 +30,7 @@ from training.dry_run import RunPlan, plan_run
 from training.guards import StopFlag, TrainingError, memory_advice, stop_flag
 from training.latent_store import LatentStore
 from training.latents import check_store, manifest_picture, open_store, write_whole
+from training.prefetch import Prefetched, leave_signals_to_the_trainer
 from training.run_log import RunLog
 from training.run_state import ADAPTER, RunState, config_differences, pack_state, read_state, restore
 from training.schedule import learning_rate
@@ -178,6 +179,9 @@ class Trainer:
             return StatefulDataLoader(
                 self.items, batch_sampler=self.batches, collate_fn=collate, num_workers=workers,
                 prefetch_factor=4 if workers else None,
+                worker_init_fn=leave_signals_to_the_trainer if workers else None,
+                # Else its state would hold a number drawn from the process's own generator.
+                generator=torch.Generator().manual_seed(keyed_seed(self.config.seed, "loader")),
             )  # fmt: skip
 
     def run(self, on_step: Callable[[int, float], None] | None = None) -> TrainSummary:
@@ -189,11 +193,11 @@ class Trainer:
             self.accelerator, self.out, steps=config.optimiser.steps, start=start, quiet=self.quiet,
             samples_per_step=config.optimiser.global_batch,
         )  # fmt: skip
-        with stop_flag() as flag, log, memory_advice(config):
-            micro_batches = iter(self.loader)
+        self.micro_batches = Prefetched(self.loader)
+        with stop_flag() as flag, log, memory_advice(config), self.micro_batches:
             stopping = False
             while self.step < config.optimiser.steps and not stopping:
-                values, stopping = self._one_step(micro_batches, flag)
+                values, stopping = self._one_step(flag)
                 losses.append(values["loss"])
                 if self.step % config.log_every_steps == 0:
                     log.step(self.step, values)
@@ -212,10 +216,10 @@ class Trainer:
             trainable=trainable_count(self.parameters), interrupted=stopping,
         )  # fmt: skip
 
-    def _one_step(self, micro_batches: Any, flag: StopFlag) -> tuple[dict[str, float], bool]:
+    def _one_step(self, flag: StopFlag) -> tuple[dict[str, float], bool]:
         total = torch.zeros((), device=self.accelerator.device)
         for _ in range(self.batches.per_step):
-            for batch in next(micro_batches):
+            for batch in next(self.micro_batches):
                 total += self._backward(batch)
         # One exchange tells every process the loss and whether any of them was asked to stop.
         shared = self.accelerator.reduce(torch.stack([total, torch.full_like(total, float(flag.set))]), "sum")
@@ -251,14 +255,19 @@ class Trainer:
         """Gradients summed over processes and clipped; their norm before clipping."""
         if self.accelerator.num_processes > 1:
             reduce_gradients(self.accelerator, self.parameters)
-        limit = self.config.optimiser.max_gradient_norm or math.inf
-        return float(torch.nn.utils.clip_grad_norm_(self.parameters, limit))
+        gradients = [one.grad for one in self.parameters if one.grad is not None]
+        norm = torch.nn.utils.get_total_norm(gradients)
+        value, limit = float(norm), self.config.optimiser.max_gradient_norm or math.inf
+        # clip_grads_with_norm_ multiplies by limit / (norm + 1e-6), or by 1: a pass over all gradients for nothing.
+        if value + 1e-6 > limit:
+            torch.nn.utils.clip_grads_with_norm_(self.parameters, limit, norm)
+        return value
 
     def _save(self) -> None:
         if not self.accelerator.is_main_process:
             return
         state = RunState(
-            step=self.step, loader=self.loader.state_dict(), loader_start=self.loader_start, layout=self._layout(),
+            step=self.step, loader=self.micro_batches.state, loader_start=self.loader_start, layout=self._layout(),
             config=self.config.model_dump(mode="json"),
         )  # fmt: skip
         files = pack_state(

@@ -28,6 +28,7 @@ from training.backbones import load_backbone  # noqa: E402
 from training.batches import StepBatches, TrainingItems, collate  # noqa: E402
 from training.config import TrainConfig  # noqa: E402
 from training.latents import open_store  # noqa: E402
+from training.prefetch import Prefetched  # noqa: E402
 from training.trainer import Trainer  # noqa: E402
 
 WIDE = tiny.TINY_TRANSFORMER | {
@@ -127,6 +128,31 @@ def big_sample_ms(folder: Path) -> float:
     return max(costs.values())
 
 
+def waiting_percent(folder: Path, *, step_s: float = 0.2, steps: int = 40) -> float:
+    """Share of wall time that a step of ``step_s`` waits for two loader workers, at the real sizes, in percent."""
+    from torchdata.stateful_dataloader import StatefulDataLoader
+
+    from training.latent_store import LatentStore
+
+    config = tiny_config(
+        "motion", optimiser={"steps": steps + 8, "global_batch": 1, "micro_batch": 1},
+        conditions={"ego_probability": 1.0, "objects_probability": 1.0},
+    )  # fmt: skip
+    items = TrainingItems(LatentStore(folder / "big"), [f"v_{index}" for index in range(8)], config)
+    loader = StatefulDataLoader(
+        items, batch_sampler=StepBatches(8, config=config), collate_fn=collate, num_workers=2, prefetch_factor=4
+    )
+    waited = 0.0
+    with Prefetched(loader) as batches:
+        for step in range(steps + 8):
+            began = time.perf_counter()
+            next(batches)
+            # The first batches wait for the workers to start.
+            waited += time.perf_counter() - began if step >= 8 else 0.0
+            time.sleep(step_s)
+    return 100 * waited / (waited + steps * step_s)
+
+
 def checkpoint_ms(job: Path, folder: Path) -> float:
     """Wall ms to write one checkpoint, disk sync included."""
     trainer = Trainer(config_for(1), data=job, out=folder, quiet=True)
@@ -149,13 +175,18 @@ def measure(rounds: int, steps: int) -> dict[str, Any]:
         bare: list[float] = []
         full: list[float] = []
         for turn in range(rounds):
-            bare += bare_step_ms(job, steps)
-            full += trainer_step_ms(job, folder / f"run_{turn}", steps)
+            # Either goes first every other time.
+            for kind in ("bare", "full") if turn % 2 else ("full", "bare"):
+                if kind == "bare":
+                    bare += bare_step_ms(job, steps)
+                else:
+                    full += trainer_step_ms(job, folder / f"run_{turn}", steps)
         result = {
             "threads": 1, "rounds": rounds, "steps": steps, "clock": "process CPU time",
             "bare_step_ms": statistics.median(bare), "trainer_step_ms": statistics.median(full),
             "loader_ms_per_tiny_sample": loader_ms(job), "loader_ms_per_real_size_sample": big_sample_ms(folder),
             "checkpoint_wall_ms": checkpoint_ms(job, folder / "checkpoint"),
+            "waiting_percent_of_200_ms_steps": waiting_percent(folder),
         }  # fmt: skip
     result["overhead_percent"] = 100 * (result["trainer_step_ms"] / result["bare_step_ms"] - 1)
     result["real_size_samples_per_second_per_worker"] = 1000 / result["loader_ms_per_real_size_sample"]

@@ -1,0 +1,90 @@
+"""One batch ahead: taking a batch from loader workers costs milliseconds of its own, which a thread can hide."""
+
+import contextlib
+import queue
+import signal
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+from torchdata.stateful_dataloader import StatefulDataLoader
+
+_LOOK_S = 0.1
+"""How often a waiting thread looks whether the other one still lives."""
+_LEAVE_S = 10.0
+"""How long the thread may take to end; a worker that hangs must not hang the run."""
+
+
+class Prefetched:
+    """A loader's batches, fetched ahead by a thread; a context manager, entered by the thread that takes the batches.
+
+    The loader runs ahead of what was handed out, so its state is noted with each batch: ``state`` is as of the last
+    batch handed out, and a resume loses none of those that were fetched but not used.
+
+    Args:
+        loader: iterated once.
+        depth: batches that wait at most.
+    """
+
+    def __init__(self, loader: StatefulDataLoader, *, depth: int = 4) -> None:
+        self._loader = loader
+        self._ready: queue.Queue[tuple[str, Any, dict[str, Any]]] = queue.Queue(maxsize=depth)
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._fetch, name="prefetch", daemon=True)
+        self.state: dict[str, Any] = {}
+
+    def __enter__(self) -> "Prefetched":
+        # Workers are forked here, before there is a second thread whose locks they could inherit.
+        self.state = self._loader.state_dict()
+        self._batches = iter(self._loader)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closed.set()
+        self._thread.join(_LEAVE_S)
+
+    def _fetch(self) -> None:
+        try:
+            for batch in self._batches:
+                if not self._put("batch", batch, self._loader.state_dict()):
+                    return
+            self._put("end", None, {})
+        except BaseException as error:
+            # It belongs to whoever waits for the batch.
+            self._put("error", error, {})
+
+    def _put(self, kind: str, content: Any, state: dict[str, Any]) -> bool:
+        while not self._closed.is_set():
+            with contextlib.suppress(queue.Full):
+                self._ready.put((kind, content, state), timeout=_LOOK_S)
+                return True
+        return False
+
+    def __iter__(self) -> Iterator[Any]:
+        return self
+
+    def __next__(self) -> Any:
+        kind, content, state = self._take()
+        if kind == "error":
+            raise content
+        if kind == "end":
+            raise StopIteration
+        self.state = state
+        return content
+
+    def _take(self) -> tuple[str, Any, dict[str, Any]]:
+        while True:
+            # Looked at before the queue: what a thread puts just before it ends is not lost.
+            running = self._thread.is_alive()
+            try:
+                return self._ready.get(timeout=_LOOK_S if running else 0.001)
+            except queue.Empty:
+                if not running:
+                    return "end", None, {}
+
+
+def leave_signals_to_the_trainer(_worker: int = 0) -> None:
+    """For a loader worker: a Ctrl-C reaches the whole group, and the step that is to be saved still needs batches."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
