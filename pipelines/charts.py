@@ -19,6 +19,7 @@ from labeling.errors import ConfigError
 
 CHARTS: dict[str, str] = {
     "count": "pipelines.charts_count",
+    "ego": "pipelines.charts_ego",
 }
 """The module of each chart; it has ``chart(name, *, quick) -> Chart``."""
 

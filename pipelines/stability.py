@@ -10,7 +10,9 @@ from typing import Literal
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
 
-STABILITY: dict[str, str] = {}
+STABILITY: dict[str, str] = {
+    "ego": "pipelines.stability_ego",
+}
 """The module of each table; it has ``stability(*, quick) -> StabilityTable``."""
 
 Verdict = Literal["held", "not held", "reported"]
