@@ -128,7 +128,7 @@ def decode_yolox(output: np.ndarray, card: YoloxCard, *, ratio: float, width: in
         height: of the frame.
     """
     scores = output[:, 4:5] * output[:, 5:]
-    rows, class_ids = np.nonzero(scores > card.score_threshold)
+    rows, class_ids = np.nonzero(scores > np.array(card.class_thresholds, np.float32))
     values = scores[rows, class_ids]
     order = np.argsort(-values, kind="stable")[:_MAX_CANDIDATES]
     rows, class_ids, values = rows[order], class_ids[order], values[order]

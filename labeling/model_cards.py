@@ -88,15 +88,19 @@ class YoloxCard(ModelCard, frozen=True):
     categories: dict[str, Category]
     """Class name to the category of the label; classes that are not here are counted but not labelled."""
     score_threshold: float = Field(default=0.3, gt=0, lt=1)
+    score_thresholds: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=dict)
+    """Class name to a threshold of its own, in place of ``score_threshold``."""
     nms_threshold: float = Field(default=0.45, gt=0, le=1)
     max_detections: int = Field(default=200, gt=0)
     """The best of a frame; how many more there were is said in ``Detections.left_out``."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "YoloxCard":
-        unknown = set(self.categories) - set(self.class_names)
+        unknown = {*self.categories, *self.score_thresholds} - set(self.class_names)
         if unknown:
-            raise ValueError(f"categories name classes that the model does not have: {sorted(unknown)}")
+            raise ValueError(
+                f"categories or score_thresholds name classes that the model does not have: {sorted(unknown)}"
+            )
         if self.input_width % 32 or self.input_height % 32:
             raise ValueError(f"a yolox input must be a multiple of 32, got {self.input_width}x{self.input_height}")
         return self
@@ -105,6 +109,11 @@ class YoloxCard(ModelCard, frozen=True):
     def class_names(self) -> tuple[str, ...]:
         """C names in the order of the output."""
         return COCO_CLASSES if self.classes == "coco80" else tuple(self.classes)
+
+    @property
+    def class_thresholds(self) -> tuple[float, ...]:
+        """C least scores in the order of the output."""
+        return tuple(self.score_thresholds.get(name, self.score_threshold) for name in self.class_names)
 
     def output_shapes(self) -> dict[str, Dimensions]:
         """One output: a row of box, objectness and class scores per grid cell."""

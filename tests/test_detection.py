@@ -92,6 +92,14 @@ def test_the_threshold_is_the_cards(score: float) -> None:
     assert len(detect([(10, 10, 50, 50, 0, score)], score_threshold=0.1)) == 1
 
 
+def test_a_class_may_have_a_threshold_of_its_own() -> None:
+    boxes = [(10, 10, 50, 50, 0, 0.35), (70, 10, 90, 60, 2, 0.2), (100, 10, 130, 60, 3, 0.35)]
+    found = detect(boxes, score_thresholds={"car": 0.4, "person": 0.15})
+    assert found.classes.tolist() == ["dog", "person"]
+    with pytest.raises(ValueError, match="score_thresholds name classes"):
+        toy_card(score_thresholds={"horse": 0.4})
+
+
 def test_an_empty_frame_has_no_detections() -> None:
     found = detect([])
     assert len(found) == 0 and found.boxes_xyxy.shape == (0, 4)
