@@ -18,6 +18,7 @@ from dataset.street_labels import StreetObject, label_actors, label_lanes
 from dataset.street_polygons import NO_OWNER, Canvas, Polygons, blank_canvas, join, make_polygons
 from dataset.street_raster import paint
 from dataset.street_scene import StillWorld, build_world, facing, plan_street
+from dataset.street_segments import segment_canvas
 from dataset.street_textures import HAZE, SKY_TANGENTS, SKY_TOP, street_atlas, texture_index, texture_size
 from dataset.street_traffic import CarActor, Density, PersonActor, cast_street
 from labeling.camera import Intrinsics, Trajectory, invert, rebased_trajectory
@@ -87,6 +88,8 @@ class StreetFrame:
     """(H, W, 3) uint8."""
     objects: tuple[StreetObject, ...]
     """Cars, people and lane lines with at least one visible pixel, cars and people from far to near."""
+    segments: np.ndarray
+    """(H, W) uint8, index into ``dataset.street_segments.SEGMENTS``; (0, 0) where it was not asked for."""
 
 
 class Street:
@@ -119,8 +122,8 @@ class Street:
     def __len__(self) -> int:
         return self.config.frames
 
-    def render(self, i: int) -> StreetFrame:
-        """Frame ``i`` with its labels; frames can be asked for in any order.
+    def render(self, i: int, *, segments: bool = False) -> StreetFrame:
+        """Frame ``i`` with its labels, and what each pixel shows if asked; frames can be asked for in any order.
 
         Raises:
             ConfigError: ``i`` is outside ``[0, frames)``.
@@ -134,7 +137,10 @@ class Street:
             self.drive.path, self.plan.lines, canvas, arc_m=float(self.drive.arc_m[i]), world_to_cam=world_to_cam,
             intrinsics=self.intrinsics,
         )  # fmt: skip
-        return StreetFrame(index=i, rgb=canvas.rgb, objects=(*objects, *lanes))
+        classes = np.zeros((0, 0), np.uint8)
+        if segments:
+            classes = segment_canvas(canvas, actors, cam_to_street=cam_to_street, intrinsics=self.intrinsics)
+        return StreetFrame(index=i, rgb=canvas.rgb, objects=(*objects, *lanes), segments=classes)
 
     def keypoints(self, frame: StreetFrame) -> list[Keypoints]:
         """The truth as label records: score 1 where a point is visible, 0 (absent) where it is hidden."""

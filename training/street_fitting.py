@@ -28,6 +28,8 @@ class FitSettings:
     """Of the moving average of weights that is returned."""
     precision: torch.dtype = torch.bfloat16
     """Of convolutions and products; weights and losses stay float32."""
+    channels_last: bool = True
+    """Lay pictures out pixel by pixel, which 2-D convolutions are faster on; networks over videos cannot."""
     report_every: int = 200
     name: str = "network"
 
@@ -42,7 +44,9 @@ def fit(network: nn.Module, make_batch: BatchMaker, loss_of: LossFunction, setti
         loss_of: scalar loss of a network and a batch.
         settings: length and rates.
     """
-    network.train().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network.train()
+    if settings.channels_last:
+        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network)
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=(0.9, 0.99)
