@@ -257,13 +257,23 @@ class EgoTable:
     """(T,) float32: one sigma of the scale, relative to it."""
     intrinsics: Intrinsics
     """Of the working picture."""
-    road: dict[str, float | None]
-    """Height over the road and pitch against it, with the pitch's sigma (null where no road was seen)."""
+    road: dict[str, float | str | None]
+    """Height over the road and pitch against it, with the pitch's sigma (null where no road was seen), and where the
+    two came from."""
 
 
-def write_ego(path: Path, motion: "EgoMotion", *, first_frame: int) -> None:
-    """Write a run's camera motion; ``first_frame`` is its first grid frame."""
+def write_ego(
+    path: Path, motion: "EgoMotion", *, first_frame: int, mounting: Mapping[str, float | str | None] | None = None
+) -> None:
+    """Write a run's camera motion; ``first_frame`` is its first grid frame, ``mounting`` what more is known of how the
+    camera looks at the road.
+
+    Raises:
+        DataError: confidence or sigma that are no numbers.
+    """
     poses = motion.trajectory.cam_to_world
+    if not (np.isfinite(motion.confidence).all() and np.isfinite(motion.scale_sigma).all()):
+        raise DataError(f"{path.name}: confidence or scale sigma are not finite; please report it")
     columns = [
         pa.array(np.arange(first_frame, first_frame + len(poses)), pa.int32()),
         pa.array(motion.trajectory.timestamps_s, _F64),
@@ -274,7 +284,7 @@ def write_ego(path: Path, motion: "EgoMotion", *, first_frame: int) -> None:
         pa.array(np.asarray(motion.scale_sigma, dtype=np.float32), _F32),
     ]
     road = {name: float(value) if np.isfinite(value) else None for name, value in asdict(motion.road).items()}
-    metadata = {"intrinsics": asdict(motion.intrinsics), "road": road}
+    metadata = {"intrinsics": asdict(motion.intrinsics), "road": {**road, **(mounting or {})}}
     write_table(path, pa.Table.from_arrays(columns, schema=EGO_SCHEMA), metadata=metadata)
 
 

@@ -17,6 +17,8 @@ from labeling.errors import TrajectoryError
 IntrinsicsSource = Literal["given", "metadata", "estimated", "prior"]
 
 _ROTATION_TOLERANCE = 1e-3
+_FOCAL_LIMITS = (0.2, 5.0)
+_FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +67,8 @@ class Intrinsics:
     """A pinhole camera without distortion.
 
     Raises:
-        TrajectoryError: a focal length that is not finite, not positive, or off by more than ten times.
+        TrajectoryError: a focal length that is not finite, not positive, or outside of 0.2 to 5 times the picture's
+            longer side (136 to 11 degrees across): one given in millimetres, or for another picture.
     """
 
     width: int
@@ -83,11 +86,12 @@ class Intrinsics:
         numbers = (self.fx, self.fy, self.cx, self.cy, self.focal_sigma)
         longest = max(self.width, self.height)
         if not all(map(math.isfinite, numbers)) or not (
-            longest / 10 <= min(self.fx, self.fy) <= max(self.fx, self.fy) <= longest * 10
+            longest * _FOCAL_LIMITS[0] <= min(self.fx, self.fy) <= max(self.fx, self.fy) <= longest * _FOCAL_LIMITS[1]
         ):
             raise TrajectoryError(
                 f"intrinsics fx={self.fx:g} fy={self.fy:g} cx={self.cx:g} cy={self.cy:g} do not fit a picture of "
-                f"{self.width}x{self.height}; give focal lengths in pixels of that picture"
+                f"{self.width}x{self.height}; give focal lengths in pixels of that picture, {_FOCAL_LIMITS[0]:g} to "
+                f"{_FOCAL_LIMITS[1]:g} times its longer side"
             )
 
     @property
@@ -120,6 +124,15 @@ def prior_intrinsics(width: int, height: int) -> Intrinsics:
         width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2,
         source="prior", focal_sigma=0.25,
     )  # fmt: skip
+
+
+def metadata_intrinsics(width: int, height: int, *, focal_35mm: float) -> Intrinsics:
+    """The camera of a file that says its focal length for 35 mm film, mm; in pixels of the *source*.
+
+    The picture's diagonal stands for the film's; crops of stabilisation and of other aspects are why it is off by some.
+    """
+    focal = focal_35mm / _FILM_DIAGONAL_MM * math.hypot(width, height)
+    return replace(prior_intrinsics(width, height), fx=focal, fy=focal, source="metadata", focal_sigma=0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

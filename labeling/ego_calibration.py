@@ -4,11 +4,12 @@ While the camera turns, the picture's middle and its edges move by different amo
 one epipolar geometry only if the focal length is right. So the robust cost of the moving model over the video's
 sharpest turns is summed for a ladder of focal lengths; its lowest point is the answer, resampled turns give its sigma,
 and the prior keeps a video that never turns where it was. The camera's height cannot be seen by one camera: it is
-given.
+given, or assumed with a sigma that says so.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,6 +28,26 @@ _REACHES = (2, 4, 6, 8, 12, 16)
 _NOISE_PX = 0.2
 _LEAST_SHIFT, _MOST_SHIFT = 0.04, 0.2
 _LEAST_CORNERS = 60
+ROAD_FRAMES = 2880
+"""Frames of a video that its road is read from, spread over its runs: two minutes tell a pitch to a hundredth of a
+degree."""
+_LEAST_WINDOW = 48
+_ASSUMED_HEIGHT_SIGMA, _GIVEN_HEIGHT_SIGMA = 0.15, 0.01
+
+PitchSource = Literal["given", "estimated", "prior"]
+HeightSource = Literal["given", "prior"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownMounting:
+    """How a camera is mounted, as far as a person has said."""
+
+    height_m: float | None = None
+    """Over the road."""
+    pitch_rad: float | None = None
+    """Positive looks down."""
+    assumed_height_m: float = 1.5
+    """Taken where no height is given."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +59,16 @@ class CameraCalibration:
     road: RoadView
     turns: int
     """Pairs of frames that spoke for the focal length."""
+    pitch_source: PitchSource
+    """``prior``: no road was seen, so every run keeps to itself."""
+    height_source: HeightSource
+    height_sigma: float
+    """One sigma of the height, relative to it: metric scale cannot be surer."""
+
+    @property
+    def pitch_rad(self) -> float | None:
+        """The pitch that holds for all runs; None where the video has not told it."""
+        return None if self.pitch_source == "prior" else self.road.pitch_rad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,23 +87,23 @@ def calibrate_camera(
     runs: Sequence[RunTracks],
     *,
     intrinsics: Intrinsics,
-    camera_height_m: float = 1.5,
+    mounting: KnownMounting | None = None,
     settings: EgoSettings | None = None,
     most_turns: int = 160,
 ) -> CameraCalibration:
-    """What all runs of a video say about its camera.
+    """What all runs of a video say about its camera: given before metadata before estimated before the prior.
 
     Args:
         runs: the video's runs, all of one picture size.
         intrinsics: of the runs' pictures. A focal length that was given or read from metadata is kept.
-        camera_height_m: over the road.
+        mounting: height and pitch where they are known.
         settings: of the estimator that the calibration will be used with.
         most_turns: pairs of frames to look at; the sharpest turns are taken.
 
     Raises:
         DataError: no runs, or runs of different pictures.
     """
-    settings = settings or EgoSettings()
+    settings, mounting = settings or EgoSettings(), mounting or KnownMounting()
     if not runs or any((run.width, run.height) != (runs[0].width, runs[0].height) for run in runs):
         raise DataError(
             "a camera is calibrated from one or more runs of one picture size; track the video's runs again"
@@ -80,16 +111,47 @@ def calibrate_camera(
     turns: list[_Turn] = []
     if intrinsics.source in ("prior", "estimated"):
         turns = find_turns(runs, intrinsics, most=most_turns)
+    if turns:
         camera = intrinsics.resized(runs[0].width, runs[0].height)
-        horizon_px = camera.fy * np.tan(_road(runs, intrinsics, camera_height_m, settings).pitch_rad) if turns else 0.0
+        horizon_px = camera.fy * np.tan(_road(runs, intrinsics, mounting, settings).pitch_rad)
         intrinsics = _with_focal(intrinsics, *focal_from_turns(turns, camera, horizon_px=horizon_px))
-    road = _road(runs, intrinsics, camera_height_m, settings)
-    return CameraCalibration(intrinsics=intrinsics, road=road, turns=len(turns))
+    return _calibration(intrinsics, mounting, _road(runs, intrinsics, mounting, settings), len(turns))
 
 
-def _road(runs: Sequence[RunTracks], intrinsics: Intrinsics, camera_height_m: float, settings: EgoSettings) -> RoadView:
-    views = [solve_run(run, intrinsics=intrinsics, camera_height_m=camera_height_m, settings=settings) for run in runs]
-    return pooled_road([view.road for view in views], camera_height_m)
+def known_camera(intrinsics: Intrinsics, mounting: KnownMounting | None = None) -> CameraCalibration:
+    """The camera of a video of which no run is looked at: what is given, else the prior."""
+    mounting = mounting or KnownMounting()
+    return _calibration(intrinsics, mounting, pooled_road([], _height_m(mounting)), 0)
+
+
+def _calibration(intrinsics: Intrinsics, mounting: KnownMounting, seen: RoadView, turns: int) -> CameraCalibration:
+    given = mounting.height_m is not None
+    pitch_source: PitchSource = "estimated" if np.isfinite(seen.pitch_sigma_rad) else "prior"
+    if mounting.pitch_rad is not None:
+        pitch_source, seen = "given", replace(seen, pitch_rad=mounting.pitch_rad, pitch_sigma_rad=0.0)
+    return CameraCalibration(
+        intrinsics=intrinsics, road=seen, turns=turns, pitch_source=pitch_source,
+        height_source="given" if given else "prior",
+        height_sigma=_GIVEN_HEIGHT_SIGMA if given else _ASSUMED_HEIGHT_SIGMA,
+    )  # fmt: skip
+
+
+def _height_m(mounting: KnownMounting) -> float:
+    return mounting.assumed_height_m if mounting.height_m is None else mounting.height_m
+
+
+def _road(
+    runs: Sequence[RunTracks], intrinsics: Intrinsics, mounting: KnownMounting, settings: EgoSettings
+) -> RoadView:
+    height_m, pitch_rad = _height_m(mounting), mounting.pitch_rad
+    if pitch_rad is not None:
+        return RoadView(height_m=height_m, pitch_rad=pitch_rad, pitch_sigma_rad=0.0)
+    frames = max(_LEAST_WINDOW, ROAD_FRAMES // len(runs))
+    views = [
+        solve_run(run.middle(frames), intrinsics=intrinsics, camera_height_m=height_m, settings=settings)
+        for run in runs
+    ]
+    return pooled_road([view.road for view in views], height_m)
 
 
 def find_turns(runs: Sequence[RunTracks], intrinsics: Intrinsics, *, most: int) -> list[_Turn]:
@@ -102,8 +164,9 @@ def find_turns(runs: Sequence[RunTracks], intrinsics: Intrinsics, *, most: int) 
             turn = _turn_from(run, start, centre, number)
             if turn is not None:
                 found.append(turn)
-    found.sort(key=lambda turn: -turn.shift)
-    return found[:most]
+        # After each run, so that a video of hours does not pile up.
+        found = sorted(found, key=lambda turn: -turn.shift)[:most]
+    return found
 
 
 def _turn_from(run: RunTracks, start: int, centre: np.ndarray, number: int) -> _Turn | None:

@@ -5,8 +5,9 @@ so that a run can be solved again with another focal length without looking at i
 """
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 
@@ -28,10 +29,15 @@ class RunTracks:
     """(T,) float64, as given."""
     frames: tuple[FrameTracks, ...]
 
+    def middle(self, count: int) -> "RunTracks":
+        """The run's middle ``count`` frames, or all of it where it is shorter."""
+        start = max(0, (len(self.frames) - count) // 2)
+        return replace(self, times_s=self.times_s[start : start + count], frames=self.frames[start : start + count])
+
     def save(self, path: Path) -> None:
-        """Write everything to one ``.npz`` file."""
+        """Write everything to one ``.npz`` file; the same tracks give the same bytes."""
         counts = [len(frame.ids) for frame in self.frames]
-        np.savez(
+        np.savez_compressed(
             path,
             size=np.array([self.width, self.height, self.source_width, self.source_height]),
             times_s=self.times_s,
@@ -72,6 +78,32 @@ def load_tracks(path: Path) -> RunTracks:
         width=width, height=height, source_width=source_width, source_height=source_height,
         times_s=arrays["times_s"], frames=frames,
     )  # fmt: skip
+
+
+class StoredTracks(Sequence[RunTracks]):
+    """A video's runs, read from their files one at a time: the corners of an hour do not fit into memory with ease."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        """``paths`` are files that ``RunTracks.save`` wrote."""
+        self._paths = list(paths)
+        self._held: tuple[int, RunTracks] | None = None
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    @overload
+    def __getitem__(self, index: int) -> RunTracks: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "StoredTracks": ...
+
+    def __getitem__(self, index: int | slice) -> "RunTracks | StoredTracks":
+        if isinstance(index, slice):
+            return StoredTracks(self._paths[index])
+        path = self._paths[index]
+        if self._held is None or self._held[0] != index:
+            self._held = (index, load_tracks(path))
+        return self._held[1]
 
 
 def matched(first: FrameTracks, second: FrameTracks) -> tuple[np.ndarray, np.ndarray]:

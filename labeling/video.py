@@ -5,7 +5,7 @@ times, never by index: sources run at variable rates.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain
@@ -72,6 +72,8 @@ class VideoInfo:
     color_tagged: bool
     full_range: bool
     interlaced: bool
+    focal_35mm: float | None = None
+    """Focal length for a picture with the diagonal of 35 mm film, mm, where the file's metadata say it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -296,7 +298,23 @@ def _video_info(
         color_matrix=colour_matrix(tag, width=frame.width, height=frame.height), color_tagged=tag != 2,
         full_range=is_full_range(int(frame.color_range), frame.format.name),
         interlaced=any(picture.interlaced_frame for picture in pictures),
+        focal_35mm=_focal_35mm({**container.metadata, **stream.metadata}),
     )  # fmt: skip
+
+
+def _focal_35mm(metadata: Mapping[str, str]) -> float | None:
+    """What phones and action cameras write: QuickTime's and Exif's names for the 35 mm equivalent."""
+    for name, text in sorted(metadata.items()):
+        plain = name.lower().replace("_", "").replace("-", "")
+        if not plain.endswith(("focallength.35mmequivalent", "focallengthin35mmformat", "focallengthin35mmfilm")):
+            continue
+        try:
+            value = float(text.removesuffix("mm").strip())
+        except ValueError:
+            continue
+        if 5 <= value <= 500:
+            return value
+    return None
 
 
 def _upright_turn_deg(frame: av.VideoFrame) -> int:

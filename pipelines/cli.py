@@ -12,6 +12,7 @@ from pipelines.cli_options import (
     LOOK,
     STAGES,
     AsJson,
+    Cameras,
     ConfigFile,
     Effort,
     Extractors,
@@ -65,6 +66,7 @@ def plan(
     workers: Workers = None,
     parts: Annotated[int, typer.Option(min=1, help="Hosts that share the videos.")] = 1,
     leave_out: LeaveOut = None,
+    cameras: Cameras = None,
     as_json: AsJson = False,
 ) -> None:
     """What labelling would take, before anything is spent: clips, disk and hours, from a minute of the footage."""
@@ -73,7 +75,7 @@ def plan(
 
     options = JobOptions(
         config=config, effort=effort, keep_share=keep_share, models=models, extractors=extractors, workers=workers,
-        leave_out=leave_out,
+        leave_out=leave_out, cameras=cameras,
     )  # fmt: skip
     raise typer.Exit(show_plan(videos, options, parts=parts, as_json=as_json))
 
@@ -90,6 +92,7 @@ def label(
     workers: Workers = None,
     part: PartOf = None,
     leave_out: LeaveOut = None,
+    cameras: Cameras = None,
     videos_kept: Annotated[str | None, typer.Option("--videos", help="all, or rgb to pack without the views.")] = None,
     captions: Annotated[Path | None, typer.Option(help="Table of key and text; other clips get the template.")] = None,
     split: Annotated[Path | None, typer.Option(help="CSV of video_id,split instead of the hash.")] = None,
@@ -100,7 +103,8 @@ def label(
 
     options = JobOptions(
         config=config, effort=effort, keep_share=keep_share, models=models, extractors=extractors, videos=videos_kept,
-        captions=captions, split=split, leave_out=leave_out, workers=workers, part=part, wait_minutes=wait,
+        captions=captions, split=split, leave_out=leave_out, cameras=cameras, workers=workers, part=part,
+        wait_minutes=wait,
     )  # fmt: skip
     raise typer.Exit(run_label(videos or [], out, options))
 
@@ -151,14 +155,14 @@ def _stage_command(name: str, text: str) -> None:
 def index(
     out: Out, videos: MoreVideos = None, config: ConfigFile = None,
     models: Models = None, keep_share: KeepShare = None, extractors: Extractors = None, leave_out: LeaveOut = None,
-    workers: Workers = None, part: PartOf = None,
+    cameras: Cameras = None, workers: Workers = None, part: PartOf = None,
 ) -> None:  # fmt: skip
     """Presentation times and keyframes of every video; packets only, nothing is decoded."""
     from pipelines.commands import JobOptions, run_index
 
     options = JobOptions(
         config=config, keep_share=keep_share, models=models, extractors=extractors, leave_out=leave_out,
-        workers=workers, part=part,
+        cameras=cameras, workers=workers, part=part,
     )  # fmt: skip
     raise typer.Exit(run_index(videos or [], out, options))
 

@@ -24,5 +24,8 @@ Extractors = Annotated[
 Workers = Annotated[int | None, typer.Option(min=0, help="Processes; by default one per core.")]
 PartOf = Annotated[str | None, typer.Option("--part", help="i/n: this host's share of the videos.")]
 LeaveOut = Annotated[Path | None, typer.Option(help="CSV of video_id,start_s,end_s: seconds to leave out at each end.")]
+Cameras = Annotated[
+    Path | None, typer.Option(help="CSV of video_id and what is known of its camera: fx,fy,cx,cy,height_m,pitch_deg.")
+]
 Wait = Annotated[float, typer.Option(help="Minutes to wait for other parts that make no progress.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]

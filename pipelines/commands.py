@@ -34,6 +34,7 @@ class JobOptions:
     captions: Path | None = None
     split: Path | None = None
     leave_out: Path | None = None
+    cameras: Path | None = None
     workers: int | None = None
     part: str | None = None
     wait_minutes: float = 0.0
@@ -98,6 +99,11 @@ def prepare_job(videos: Sequence[Path], out: Path, options: JobOptions) -> Job:
     sources = find_videos(videos, leave_out=options.leave_out) if videos else []
     job = open_or_create(out, videos=sources, models_dir=options.models)
     config = configured(job.config, options)
+    unknown = sorted(set(config.cameras) - set(job.sources))
+    if unknown:
+        raise ConfigError(
+            f"cameras: {unknown[0]!r} is none of the videos; use ids, as {', '.join(list(job.sources)[:3])}"
+        )
     job = Job(job.root.absolute(), config, job.sources, models_dir=job.models_dir)
     if options.models is not None and not options.models.is_dir():
         raise ConfigError(f"--models {options.models}: is no folder; give the folder that holds the ONNX files")
@@ -124,6 +130,8 @@ def configured(config: Config, options: JobOptions) -> Config:
         changes["select"] = {"keep_share": options.keep_share}
     if options.split is not None:
         changes.setdefault("select", {})["split"] = read_split(options.split)
+    if options.cameras is not None:
+        changes["cameras"] = read_cameras(options.cameras)
     if options.extractors is not None:
         names = [name.strip() for name in options.extractors.split(",") if name.strip()]
         changes["keypoints"] = {"extractors": names}
@@ -145,6 +153,25 @@ def read_split(path: Path) -> dict[str, str]:
             return {row["video_id"]: row["split"] for row in csv.DictReader(stream)}
     except (OSError, KeyError, UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path}: cannot be read as video_id,split ({error}); mend the table") from error
+
+
+def read_cameras(path: Path) -> dict[str, dict[str, float]]:
+    """What is known of each video's camera, from a CSV table with the column ``video_id`` and any of those of
+    ``CameraSettings`` (fx, fy, cx, cy, focal_sigma, height_m, pitch_deg); empty cells are not known.
+
+    Raises:
+        ConfigError: it cannot be read, lacks ``video_id``, or holds something that is no number.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            return {
+                row.pop("video_id"): {name: float(cell) for name, cell in row.items() if cell}
+                for row in csv.DictReader(stream)
+            }
+    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
+        raise ConfigError(
+            f"{path}: cannot be read as video_id,fx,fy,cx,cy,height_m,pitch_deg ({error}); mend the table"
+        ) from error
 
 
 def check_extractors(job: Job, reporter: ConsoleReporter) -> None:

@@ -32,12 +32,29 @@ class PictureSettings(Settings):
 
 
 class CameraSettings(Settings):
-    """A calibrated camera, in pixels of the source. Without one the focal length is assumed."""
+    """What is known of a camera, in pixels of the source. What is not said is read from the file's metadata, else
+    estimated from the video, else assumed."""
 
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
-    cx: float
-    cy: float
+    fx: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    fy: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    """By default as ``fx``."""
+    cx: float | None = Field(default=None, allow_inf_nan=False)
+    """By default the picture's middle, as ``cy``."""
+    cy: float | None = Field(default=None, allow_inf_nan=False)
+    focal_sigma: float = Field(default=0.01, ge=0, lt=1)
+    """One sigma of the focal length, relative to it."""
+    height_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    """Over the road; metric scale is proportional to it."""
+    pitch_deg: float | None = Field(default=None, gt=-45, lt=45)
+    """Against the road, positive looks down."""
+
+    @model_validator(mode="after")
+    def _complete(self) -> "CameraSettings":
+        if self.fx is None and self.fy is not None:
+            raise ValueError("fy is given without fx; give fx, or both")
+        if (self.cx is None) != (self.cy is None):
+            raise ValueError("cx and cy go together; give both or neither")
+        return self
 
 
 class CountSettings(Settings):
@@ -88,7 +105,8 @@ class KeypointSettings(Settings):
 class EgoStageSettings(Settings):
     """How the camera's motion is estimated."""
 
-    camera_height_m: float = Field(default=1.5, gt=0)
+    camera_height_m: float = Field(default=1.5, gt=0, allow_inf_nan=False)
+    """Assumed of cameras of which no height is given."""
     motion: EgoSettings = EgoSettings()
 
 
@@ -125,6 +143,9 @@ class Config(Settings):
     clip: ClipSettings = ClipSettings()
     picture: PictureSettings = PictureSettings()
     camera: CameraSettings | None = None
+    """Of every video."""
+    cameras: dict[str, CameraSettings] = {}
+    """By video id: what they say goes before ``camera`` (``--cameras FILE``)."""
     encoder: EncoderSettings = EncoderSettings()
     count: CountSettings = CountSettings()
     select: SelectSettings = SelectSettings()
@@ -142,6 +163,17 @@ class Config(Settings):
                     f"and that clip.run_frames {self.clip.run_frames}: clips are cut at keyframes"
                 )
         return self
+
+
+def video_camera(config: Config, video_id: str) -> CameraSettings:
+    """What is known of one video's camera: its own settings, before those of all videos."""
+    common = (config.camera or CameraSettings()).model_dump(exclude_none=True)
+    own = config.cameras.get(video_id, CameraSettings()).model_dump(exclude_none=True)
+    if "fx" in own:
+        common.pop("fy", None)
+    else:
+        own.pop("focal_sigma")
+    return CameraSettings(**{**common, **own})
 
 
 def with_effort(config: Config, effort: Effort) -> Config:

@@ -20,13 +20,19 @@ def counts_path(video_id: str) -> str:
     return f"videos/{video_id}/counts.parquet"
 
 
+def camera_path(video_id: str) -> str:
+    """The one camera of a video."""
+    return f"videos/{video_id}/camera.json"
+
+
 def run_item(video_id: str, run: Span) -> str:
     """A run's item name."""
     return f"{video_id}/{run_name(run)}"
 
 
 def run_path(video_id: str, run: Span, suffix: str) -> str:
-    """A run's file: ``.mp4``, ``.skeleton.mp4``, ``.frames.parquet``, ``.keypoints.parquet`` or ``.ego.parquet``."""
+    """A run's file: ``.mp4``, ``.skeleton.mp4``, ``.frames.parquet``, ``.keypoints.parquet``, ``.corners.npz`` or
+    ``.ego.parquet``."""
     return f"videos/{video_id}/{run_name(run)}{suffix}"
 
 

@@ -5,11 +5,13 @@ in a scratch folder; a still smaller one before it pays for loading and compilin
 """
 
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dataset.receipts import Receipt, hashed_share, read_receipts
+from labeling.ego_calibration import ROAD_FRAMES
 from labeling.errors import ConfigError, VideoError
 from labeling.timeline import ClipSettings
 from labeling.video import probe
@@ -99,7 +101,7 @@ def plan_job(
     return JobPlan(
         videos=len(lengths), broken=broken, source_hours=sum(lengths.values()) / 3600, clips=total, kept_clips=kept,
         sampled_clips=sampled, clip_hours=sampled * _clip_s(config.clip) / 3600,
-        stages=_scaled(receipts, measured, lengths, clips=total, sampled=sampled),
+        stages=_scaled(receipts, measured, lengths, candidates=candidates, sampled=sampled),
         calibration_s=measured.window_s, workers=workers, parts=parts,
         largest_part=_largest_part(lengths, parts),
     )  # fmt: skip
@@ -201,6 +203,10 @@ class _Measured:
     video_s: float
     clips: int
     kept_clips: int
+    frames_per_clip: float
+    """Of runs, over kept clips: overlaps are cut once."""
+    camera_frames: int
+    """That the videos' cameras were read from."""
 
     @classmethod
     def of(cls, receipts: dict[str, dict[str, Receipt]]) -> "_Measured":
@@ -211,10 +217,14 @@ class _Measured:
         kept = max(1, int(chosen.facts["kept"]))
         # Clips outside the windows have rows in the selection too; where every clip is kept none is counted.
         clips = sum(int(receipt.facts["clips"]) for receipt in receipts["count"].values()) or kept
+        frames: Counter[str] = Counter()
+        for receipt in receipts["cut"].values():
+            frames[receipt.item.split("/")[0]] += int(receipt.facts["frames"])
         return cls(
-            window_s=sum(float(receipt.facts["frames"]) for receipt in receipts["cut"].values()) / _FPS,
+            window_s=frames.total() / _FPS,
             video_s=sum(float(receipt.facts["seconds"]) for receipt in receipts["index"].values()),
-            clips=clips, kept_clips=kept,
+            clips=clips, kept_clips=kept, frames_per_clip=frames.total() / kept,
+            camera_frames=sum(min(count, ROAD_FRAMES) for count in frames.values()),
         )  # fmt: skip
 
 
@@ -223,12 +233,17 @@ def _scaled(
     measured: _Measured,
     lengths_s: dict[str, float],
     *,
-    clips: int,
+    candidates: dict[str, int],
     sampled: int,
 ) -> tuple[StageCost, ...]:
-    """Costs of the whole job: reading grows with the footage, counting with its clips, the rest with what is taken."""
+    """Costs of the whole job: reading grows with the footage, counting with its clips, the rest with what is taken; of
+    a video's camera only so much is looked at."""
+    clips = sum(candidates.values())
+    taken = {name: count * sampled / clips * measured.frames_per_clip for name, count in candidates.items()}
+    looked = sum(min(frames, ROAD_FRAMES) for frames in taken.values())
     by_length = sum(lengths_s.values()) / max(measured.video_s, 1e-9)
     factors = {"source": by_length, "index": by_length, "count": clips / measured.clips, "select": 1.0}
+    factors["camera"] = looked / max(measured.camera_frames, 1)
     costs = []
     for stage, made in receipts.items():
         factor = factors.get(stage, sampled / measured.kept_clips)

@@ -33,7 +33,7 @@ from pipelines.stage import NotReadyError, WorkItem
 from pipelines.stages_source import job_selection, picture_map
 from pipelines.stages_views import clip_labels, clip_trajectory, find_run
 
-_BEFORE = ("cut", "keypoints", "ego", "skeleton", "render")
+_BEFORE = ("cut", "keypoints", "corners", "camera", "ego", "skeleton", "render")
 
 
 class PackStage:

@@ -65,7 +65,7 @@ class IndexStage:
         """One item per video whose content is known."""
         return [
             WorkItem(
-                stage=self.name, name=name, owner=name, version=1, settings={},
+                stage=self.name, name=name, owner=name, version=2, settings={},
                 inputs={"source": receipt.facts["sha256"]}, outputs=(index_path(name),),
                 payload={"path": str(job.sources[name].path)}, weight=float(receipt.facts["seen"].get("size", 1)),
             )

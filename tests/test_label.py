@@ -124,12 +124,14 @@ def test_two_parts_make_what_one_makes(tmp_path, videos, detector, counted):
     ("changes", "first", "later"),
     [
         ({"views": {"object_variant": 1}}, "render", set()),
-        ({"ego": {"camera_height_m": 1.2}}, "ego", {"render"}),
+        ({"ego": {"camera_height_m": 1.2}}, "camera", {"ego", "render"}),
+        ({"ego": {"motion": {"smoothing_lag": 2}}}, "ego", {"camera", "render"}),
+        ({"cameras": {"short": {"fx": 90.0}}}, "camera", {"ego", "render"}),
         ({"pack": {"videos": "rgb"}}, "render", set()),
         ({"views": {"skeleton_encoder": {"gop": 2}}}, "skeleton", set()),
-        ({"encoder": {"crf": 30}}, "cut", {"keypoints", "ego", "skeleton", "render"}),
+        ({"encoder": {"crf": 30}}, "cut", {"keypoints", "corners", "camera", "ego", "skeleton", "render"}),
     ],
-    ids=["object variant", "camera height", "videos", "skeleton encoder", "encoder"],
+    ids=["object variant", "camera height", "smoothing", "one video's camera", "videos", "skeleton encoder", "encoder"],
 )
 def test_a_changed_setting_redoes_only_what_depends_on_it(tmp_path, short_video, changes, first, later):
     sources = {"short": short_video}
