@@ -34,7 +34,7 @@ def mark_cells(lit: np.ndarray, shapes: Capsules, *, width: int, height: int, ce
 
 
 @njit(cache=True, error_model="numpy")
-def _row_span(x0, y0, x1, y1, radius, ux, uy, length, y):  # pragma: no cover - compiled
+def row_span(x0, y0, x1, y1, radius, ux, uy, length, y):  # pragma: no cover - compiled
     """First and last x of a capsule on row y (an interval, for a capsule is convex); empty where first > last."""
     low, high = np.inf, -np.inf
     reach = radius * radius - (y - y0) * (y - y0)
@@ -70,7 +70,8 @@ def _narrow(start, end, slope, offset, least, most):  # pragma: no cover - compi
 
 
 @njit(cache=True, error_model="numpy")
-def _direction(x0, y0, x1, y1):  # pragma: no cover - compiled
+def direction(x0, y0, x1, y1):  # pragma: no cover - compiled
+    """Unit vector and length of a line, all 0 for a dot."""
     dx, dy = x1 - x0, y1 - y0
     length = math.sqrt(dx * dx + dy * dy)
     if length == 0.0:
@@ -79,7 +80,7 @@ def _direction(x0, y0, x1, y1):  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model="numpy")
-def _whole(low, high, limit):  # pragma: no cover - compiled
+def whole(low, high, limit):  # pragma: no cover - compiled
     """Integers in [low, high] and [0, limit), half-open."""
     return math.ceil(min(max(low, 0.0), float(limit))), math.floor(max(min(high, limit - 1.0), -1.0)) + 1
 
@@ -90,11 +91,11 @@ def _fill_all(picture, ends, radii, colours):  # pragma: no cover - compiled
     for i in range(len(radii)):
         x0, y0, x1, y1 = ends[i, 0], ends[i, 1], ends[i, 2], ends[i, 3]
         radius, red, green, blue = radii[i], colours[i, 0], colours[i, 1], colours[i, 2]
-        ux, uy, length = _direction(x0, y0, x1, y1)
-        top, bottom = _whole(min(y0, y1) - radius, max(y0, y1) + radius, height)
+        ux, uy, length = direction(x0, y0, x1, y1)
+        top, bottom = whole(min(y0, y1) - radius, max(y0, y1) + radius, height)
         for y in range(top, bottom):
-            low, high = _row_span(x0, y0, x1, y1, radius, ux, uy, length, float(y))
-            left, right = _whole(low, high, width)
+            low, high = row_span(x0, y0, x1, y1, radius, ux, uy, length, float(y))
+            left, right = whole(low, high, width)
             for x in range(left, right):
                 picture[y, x, 0], picture[y, x, 1], picture[y, x, 2] = red, green, blue
 
@@ -104,11 +105,11 @@ def _mark_all(lit, ends, radii, width, height, cell):  # pragma: no cover - comp
     for i in range(len(radii)):
         x0, y0, x1, y1 = ends[i, 0], ends[i, 1], ends[i, 2], ends[i, 3]
         radius = radii[i]
-        ux, uy, length = _direction(x0, y0, x1, y1)
-        top, bottom = _whole(min(y0, y1) - radius, max(y0, y1) + radius, height)
+        ux, uy, length = direction(x0, y0, x1, y1)
+        top, bottom = whole(min(y0, y1) - radius, max(y0, y1) + radius, height)
         for y in range(top, bottom):
-            low, high = _row_span(x0, y0, x1, y1, radius, ux, uy, length, float(y))
-            left, right = _whole(low, high, width)
+            low, high = row_span(x0, y0, x1, y1, radius, ux, uy, length, float(y))
+            left, right = whole(low, high, width)
             if left < right:
                 for column in range(left // cell, (right - 1) // cell + 1):
                     lit[y // cell, column] = True

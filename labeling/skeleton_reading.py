@@ -15,7 +15,8 @@ import numpy as np
 from labeling.errors import DataError
 from labeling.labels import POINT_DETECTED, Keypoints
 from labeling.schemas import keypoint_schema
-from labeling.skeleton_redraw import redrawn_points
+from labeling.skeleton_evidence import explained_pixels, line_evidence, merged_places, on_dots
+from labeling.skeleton_redraw import redrawn_parts, redrawn_points
 from labeling.skeleton_video import DEFAULT_STYLE, LABEL_HEIGHT, LABEL_WIDTH, SkeletonStyle, dot_edges, style_radii
 
 LEAST_POINTS = 4
@@ -24,14 +25,25 @@ LEAST_POINTS = 4
 _DARKEST, _PALEST = 96, 80
 _SAME_POINT = 2.0
 _LEAST_HUE, _LEAST_LIT = 0.4, 0.85
-_OVERSHOOT = 0.25
-_SAMPLES = 13
 _LEAST_UNCLAIMED = 0.5
 _LEAST_DOT, _CLEAR_DOT, _LEAST_SCORE = 0.5, 0.8, 1.0
 _ROUNDS = 4
+_SURE, _SURE_POINTS = 0.75, 12
+"""A car that explains so much of its own drawing, with so many points, is taken out before the rest is read again."""
 _LEAST_PIXELS, _MOST_PROPOSALS = 3, 64
 """A piece of fewer pixels proposes nothing, and a point has no more proposals: noise shall not take minutes."""
-_SEARCH = np.arange(-2.0, 2.01, 0.5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SkeletonReading:
+    """Cars read from one picture, and how far they account for it."""
+
+    cars: tuple[Keypoints, ...]
+    """Without track ids; a present point scores 1, a car the share of its drawing that the picture shows."""
+    unexplained_share: float
+    """Of the pixels that have a car's hue, those that no car read draws within a pixel: 0 when all came back."""
+    left_out: int
+    """Places that were not looked at because there were too many: more than 0 in noise and in piles of cars."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,6 +68,18 @@ class _Evidence:
     """(n, m) float64: share of the line that is not black; a drawn edge may be painted over but is never black."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _ReadCar:
+    """One car, settled."""
+
+    places: dict[int, np.ndarray]
+    """(2,) each, pixels of the picture."""
+    drawn: np.ndarray
+    """(H, W) int32 edge numbers of its drawing, or -1."""
+    agreement: float
+    """Share of the drawing that the picture shows."""
+
+
 _Car = dict[int, int]
 """Points of the schema and the number of the proposal that each takes."""
 
@@ -64,7 +88,26 @@ def skeletons_from_frame(
     picture: np.ndarray, *, schema: str = "car66", frame: int = 0, label_width: int = LABEL_WIDTH,
     label_height: int = LABEL_HEIGHT, style: SkeletonStyle = DEFAULT_STYLE,
 ) -> list[Keypoints]:  # fmt: skip
+    """The cars of ``read_skeletons``, without what it says of their trustworthiness.
+
+    Raises:
+        DataError: as ``read_skeletons``.
+    """
+    reading = read_skeletons(
+        picture, schema=schema, frame=frame, label_width=label_width, label_height=label_height, style=style
+    )
+    return list(reading.cars)
+
+
+def read_skeletons(
+    picture: np.ndarray, *, schema: str = "car66", frame: int = 0, label_width: int = LABEL_WIDTH,
+    label_height: int = LABEL_HEIGHT, style: SkeletonStyle = DEFAULT_STYLE,
+) -> SkeletonReading:  # fmt: skip
     """Cars of a skeleton picture as labels, each with the points that its colours show.
+
+    Within 2 px of what was drawn, where lines are not painted over; what dots or other cars cover may be missing. Time
+    is bounded whatever the picture shows: of every hue the largest pieces propose, and of every point's proposals the
+    best are kept.
 
     Args:
         picture: (H, W, 3) uint8, RGB, as ``draw_skeletons`` draws it or as a network imitates it.
@@ -75,8 +118,7 @@ def skeletons_from_frame(
         style: as it was drawn.
 
     Returns:
-        Labels without track ids, pixels of ``label_width`` x ``label_height``; a present point scores 1. Within 2 px of
-        what was drawn, where lines are not painted over; what dots or other cars cover may be missing.
+        Labels in pixels of ``label_width`` x ``label_height``, and what they leave unexplained.
 
     Raises:
         DataError: ``picture`` is not (H, W, 3) uint8, or the schema is not a car's.
@@ -89,22 +131,43 @@ def skeletons_from_frame(
     height, width = picture.shape[:2]
     radii = style_radii(style.car_line, style.car_dot, width=width, height=height)
     parts = edge_of_pixels(picture, edge_count=len(table.edges))
-    proposals = _propose(parts, schema, radii[1])
-    evidence = _evidence(parts, picture.max(axis=2) > _DARKEST // 2, proposals, table.edges, radii[1])
-    cars = _unclaimed(_join(proposals, evidence, table.edges), parts, proposals, table.edges)
+    lit = picture.max(axis=2) > _DARKEST // 2
+    rest, read, left_out = parts, list[_ReadCar](), 0
+    for last in (False, True):
+        found, missed = _read_once(rest, lit, schema, radii)
+        left_out = max(left_out, missed)
+        # The second time only what the surest cars leave is read, and all of it is taken.
+        sure = [car for car in found if last or (car.agreement >= _SURE and len(car.places) >= _SURE_POINTS)]
+        read += sure
+        rest = rest.copy()
+        for car in sure:
+            rest[explained_pixels(rest, car.drawn)] = -1
     scale = np.array([label_width / width, label_height / height])
-    labels = []
+    coloured = int((parts >= 0).sum())
+    return SkeletonReading(
+        cars=tuple(_label(car, schema, frame, scale) for car in read),
+        unexplained_share=float((rest >= 0).sum() / coloured) if coloured else 0.0, left_out=left_out,
+    )  # fmt: skip
+
+
+def _read_once(
+    parts: np.ndarray, lit: np.ndarray, schema: str, radii: tuple[float, float]
+) -> tuple[list["_ReadCar"], int]:
+    """The cars of a picture of edge numbers, and how many places were left out of account."""
+    edges = keypoint_schema(schema).edges
+    proposals, left_out = _propose(parts, schema, radii[1])
+    evidence = _evidence(parts, lit, proposals, edges, radii[1])
+    cars = _unclaimed(_join(proposals, evidence, edges), parts, proposals, edges)
+    read = []
     for car in sorted(cars, key=lambda car: sorted(car.items())):
         places = {point: proposals[point].places[number] for point, number in car.items()}
         unsure = [point for point, number in sorted(car.items()) if proposals[point].dots[number] < _CLEAR_DOT]
         places = redrawn_points(parts, places, unsure, schema=schema, radii=radii)
-        if len(places) < LEAST_POINTS:
-            continue
-        points = np.zeros((table.point_count, 3))
-        for point, place in places.items():
-            points[point] = *((place + 0.5) * scale - 0.5), 1.0
-        labels.append(_label(points, schema, frame))
-    return labels
+        if len(places) >= LEAST_POINTS:
+            drawn = redrawn_parts((parts.shape[0], parts.shape[1]), places, schema=schema, radii=radii)
+            on = drawn >= 0
+            read.append(_ReadCar(places=places, drawn=drawn, agreement=float((drawn == parts)[on].mean())))
+    return read, left_out
 
 
 def edge_of_pixels(picture: np.ndarray, *, edge_count: int) -> np.ndarray:
@@ -117,13 +180,15 @@ def edge_of_pixels(picture: np.ndarray, *, edge_count: int) -> np.ndarray:
     return edge
 
 
-def _propose(parts: np.ndarray, schema: str, dot_radius: float) -> list[_Proposals]:
-    """Proposals for each point, from the ends of each hue's pieces."""
+def _propose(parts: np.ndarray, schema: str, dot_radius: float) -> tuple[list[_Proposals], int]:
+    """Proposals for each point, from the ends of each hue's pieces; and how many pieces and proposals were too many."""
     edges, dots = keypoint_schema(schema).edges, dot_edges(schema)
     places: list[list[np.ndarray]] = [[] for _ in dots]
-    last = np.array(parts.shape[::-1]) - 1.0
+    last, left_out = np.array(parts.shape[::-1]) - 1.0, 0
     for edge, ends in enumerate(edges):
-        for middle, axis, half in _pieces(parts == edge):
+        pieces, missed = _pieces(parts == edge)
+        left_out += missed
+        for middle, axis, half in pieces:
             for way in (-1.0, 1.0):
                 tip = middle + way * half * axis
                 if min(*tip, *(last - tip)) < 1.0:
@@ -133,18 +198,20 @@ def _propose(parts: np.ndarray, schema: str, dot_radius: float) -> list[_Proposa
                     own = dots[point] == edge
                     inward = min(dot_radius - 0.25, half) if own else -dot_radius - 0.3
                     places[point].append(tip - way * inward * axis)
-    return [
-        _on_dots(parts, int(edge), _merged(np.array(these).reshape(-1, 2)), dot_radius)
-        for edge, these in zip(dots, places, strict=True)
-    ]
+    proposals = []
+    for edge, these in zip(dots, places, strict=True):
+        found, missed = _on_dots(parts, int(edge), np.array(these).reshape(-1, 2), dot_radius)
+        left_out += missed
+        proposals.append(found)
+    return proposals, left_out
 
 
-def _pieces(mask: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Middle (2,), axis (2,) and half length of the largest connected pieces of a mask, along their principal axes."""
+def _pieces(mask: np.ndarray) -> tuple[list[tuple[np.ndarray, np.ndarray, float]], int]:
+    """Middle (2,), axis (2,) and half length of a mask's largest connected pieces; and how many more there were."""
     left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
     crop = mask[top : top + height, left : left + width].astype(np.uint8)
     if not crop.size:
-        return []
+        return [], 0
     _, numbers, stats, _ = cv2.connectedComponentsWithStats(crop, connectivity=8)
     area = stats[1:, cv2.CC_STAT_AREA]
     largest = 1 + np.argsort(-area, kind="stable")[:_MOST_PROPOSALS]
@@ -159,37 +226,28 @@ def _pieces(mask: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:
         along = centred @ axis
         middle = pixels.mean(axis=0) + (along.max() + along.min()) / 2 * axis
         pieces.append((middle, axis, float(along.max() - along.min()) / 2))
-    return pieces
+    return pieces, int((area >= _LEAST_PIXELS).sum()) - len(pieces)
 
 
-def _merged(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places of one point that lie within two pixels, taken together, the most agreed upon first; and their numbers."""
-    means, votes = [], []
-    left = np.ones(len(places), bool)
-    near = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1)) <= _SAME_POINT
-    while left.any():
-        agreeing = (near & left).sum(axis=1) * left
-        members = near[int(np.argmax(agreeing))] & left
-        means.append(places[members].mean(axis=0))
-        votes.append(float(members.sum()))
-        left &= ~members
-    return np.array(means).reshape(-1, 2), np.array(votes)
+def _on_dots(parts: np.ndarray, edge: int, places: np.ndarray, dot_radius: float) -> tuple[_Proposals, int]:
+    """Proposals moved onto the dots of their point where one is seen; without a dot or a second vote, dropped.
 
-
-def _on_dots(parts: np.ndarray, edge: int, proposed: tuple[np.ndarray, np.ndarray], dot_radius: float) -> _Proposals:
-    """Proposals moved onto the dots of their point where one is seen; without a dot or a second vote, dropped."""
+    Returns:
+        The best, and how many more there were.
+    """
+    means, votes = merged_places(places, _SAME_POINT)
+    moved, seen = on_dots(parts, edge, means, dot_radius)
     kept: dict[tuple[float, float], tuple[float, float]] = {}
-    for place, votes in zip(*proposed, strict=True):
-        place, seen = _on_dot(parts, edge, place, dot_radius)
-        if seen < _LEAST_DOT and votes < 2:
+    for place, vote, share in zip(moved.tolist(), votes.tolist(), seen.tolist(), strict=True):
+        if share < _LEAST_DOT and vote < 2:
             continue
         same = [other for other in kept if math.dist(other, place) < _SAME_POINT / 2]
-        key = same[0] if same else (float(place[0]), float(place[1]))
+        key = same[0] if same else (place[0], place[1])
         before = kept.get(key, (0.0, 0.0))
-        kept[key] = (before[0] + votes, max(before[1], seen))
+        kept[key] = (before[0] + vote, max(before[1], share))
     best = sorted(kept.items(), key=lambda one: (-one[1][1] - 0.1 * one[1][0], one[0]))[:_MOST_PROPOSALS]
-    places, numbers = (np.array([one[i] for one in best]).reshape(-1, 2) for i in (0, 1))
-    return _Proposals(places=places, votes=numbers[:, 0], dots=numbers[:, 1])
+    found, numbers = (np.array([one[i] for one in best]).reshape(-1, 2) for i in (0, 1))
+    return _Proposals(places=found, votes=numbers[:, 0], dots=numbers[:, 1]), len(kept) - len(best)
 
 
 def _evidence(
@@ -202,30 +260,9 @@ def _evidence(
     found = []
     for edge, (a, b) in enumerate(edges):
         hue = cv2.dilate((parts == edge).astype(np.uint8), box)
-        found.append(_between(hue, wide, proposals[a].places, proposals[b].places, dot_radius))
+        shares = line_evidence(hue, wide, proposals[a].places, proposals[b].places, dot_radius)
+        found.append(_Evidence(hue=shares[0], lit=shares[1]))
     return found
-
-
-def _between(hue: np.ndarray, lit: np.ndarray, first: np.ndarray, second: np.ndarray, dot_radius: float) -> _Evidence:
-    way = second[None] - first[:, None]
-    length = np.maximum(np.hypot(way[..., 0], way[..., 1]), 1e-9)[..., None]
-    # Clear of the dots at both ends, which have hues of their own.
-    margin = np.minimum((dot_radius + 0.5) / length, 0.45)
-    inner = _look_up(hue, first, way, margin + (1 - 2 * margin) * np.linspace(0, 1, _SAMPLES)).mean(axis=-1)
-    whole = _look_up(lit, first, way, np.broadcast_to(np.linspace(0, 1, 2 * _SAMPLES), (*way.shape[:2], 2 * _SAMPLES)))
-    # A line that runs on beyond an end means that the end is not one, but where another line broke it.
-    past = (dot_radius + 2.5) / length
-    beyond = _look_up(hue, first, way, np.concatenate([-past, 1 + past], axis=-1)).max(axis=-1)
-    return _Evidence(hue=np.where(beyond > 0, _OVERSHOOT, 1.0) * inner, lit=whole.mean(axis=-1))
-
-
-def _look_up(mask: np.ndarray, first: np.ndarray, way: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(n, m, S) float64: the mask (0 outside the picture) at shares ``at`` (n, m, S) of the way."""
-    places = np.rint(first[:, None, None] + way[:, :, None] * at[..., None]).astype(np.int64)
-    height, width = mask.shape
-    inside = ((places >= 0) & (places < [width, height])).all(axis=-1)
-    x, y = np.clip(places[..., 0], 0, width - 1), np.clip(places[..., 1], 0, height - 1)
-    return (mask[y, x] * inside).astype(np.float64)
 
 
 def _join(
@@ -317,27 +354,13 @@ def _unclaimed(
     return kept
 
 
-def _on_dot(parts: np.ndarray, edge: int, place: np.ndarray, dot_radius: float) -> tuple[np.ndarray, float]:
-    """``place`` moved to where a dot of its hue fits best within two pixels, if one does, and the dot's seen share."""
-    height, width = parts.shape
-    reach = math.ceil(dot_radius + _SEARCH[-1])
-    columns, rows = np.meshgrid(*(np.arange(round(c) - reach, round(c) + reach + 1) for c in place))
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    hue = parts[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
-    gain = np.where(hue == edge, 1.0, -1.0)[inside]
-    centres = place + np.stack(np.meshgrid(_SEARCH, _SEARCH), axis=-1).reshape(-1, 2)
-    covered = np.hypot(columns[inside] - centres[:, :1], rows[inside] - centres[:, 1:]) <= dot_radius
-    scores = covered @ gain / max(math.pi * dot_radius**2, 1.0)
-    best = float(scores.max()) if len(gain) else 0.0
-    if best < _LEAST_DOT:
-        return place, max(best, 0.0)
-    return centres[scores >= best - 1e-9].mean(axis=0), min(best, 1.0)
-
-
-def _label(points: np.ndarray, schema: str, frame: int) -> Keypoints:
+def _label(car: _ReadCar, schema: str, frame: int, scale: np.ndarray) -> Keypoints:
+    points = np.zeros((keypoint_schema(schema).point_count, 3))
+    for point, place in car.places.items():
+        points[point] = *((place + 0.5) * scale - 0.5), 1.0
     seen = points[:, 2] > 0
     box = np.concatenate([points[seen, :2].min(axis=0), points[seen, :2].max(axis=0)])
     return Keypoints(
-        frame=frame, category="car", schema=schema, score=float(seen.mean()), box_xyxy=box.astype(np.float32),
+        frame=frame, category="car", schema=schema, score=car.agreement, box_xyxy=box.astype(np.float32),
         points=points.astype(np.float32), point_source=np.where(seen, POINT_DETECTED, 0).astype(np.int8),
     )  # fmt: skip
