@@ -63,6 +63,8 @@ class StreetConfig:
     camera_height_m: float = 1.5
     camera_pitch_deg: float = 0.0
     """Positive looks down. A given trajectory that moves brings its own."""
+    walkers_per_100_m: float | None = None
+    """People per 100 m of pavement, on each side. None: as the scenario has it."""
 
     def __post_init__(self) -> None:
         if self.scenario not in SCENARIOS:
@@ -105,7 +107,7 @@ class Street:
         rng = np.random.default_rng([config.seed, 7])
         angle = rng.uniform(0, 2 * np.pi)
         self._sun = np.array([0.6 * np.cos(angle), -0.8, 0.6 * np.sin(angle)])
-        density = _DENSITY[config.scenario]
+        density = _density(config)
         town = config.scenario not in ("road_only", "wall")
         plan = plan_street(
             rng, parking=density.parked > 0, buildings=town, trees=town, wall=config.scenario == "wall",
@@ -261,6 +263,12 @@ _DENSITY: dict[Scenario, Density] = {
     "lead_leaves": Density(parked=0.3, lead_leaves=True),
     "cross_traffic": Density(parked=0.3, cross=True),
 }
+
+
+def _density(config: StreetConfig) -> Density:
+    density = _DENSITY[config.scenario]
+    return density if config.walkers_per_100_m is None else replace(density, walkers=config.walkers_per_100_m)
+
 
 _SPEEDS: dict[Scenario, tuple[tuple[float, float], ...]] = {
     "traffic": ((0, 6.0), (3, 8.0), (6, 4.0), (9, 7.0)),

@@ -21,9 +21,11 @@ from training.street_batches import Batch, CropBatches, FieldBatches, mirror_ord
 from training.street_export import export_model, fold_norms
 from training.street_fitting import FitSettings, fit, rate_at
 from training.street_losses import detector_loss, field_loss
-from training.street_models import MODEL_NAMES, evaluate, plan_streets, recipe
+from training.street_models import evaluate
 from training.street_networks import FieldGraph, FieldNetwork, SimccGraph, SimccNetwork, StreetDetector
-from training.street_pool import ObjectTruth, PoolCrop, PoolFrame, StreetPool, render_pool
+from training.street_plans import plan_streets
+from training.street_pool import PICTURE_SIZE, ObjectTruth, PoolCrop, PoolFrame, StreetPool, render_pool
+from training.street_recipes import MODEL_NAMES, recipe
 from training.street_scores import distance_to_curve
 from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses, grid_cells
 
@@ -282,7 +284,7 @@ def test_the_pool_holds_what_the_street_shows() -> None:
     (plan,) = plan_streets(500, 1, frames=1)
     pool = render_pool([plan], workers=1)
     truth = Street(plan.config).render(plan.frames[0])
-    np.testing.assert_array_equal(pool.frames[0].picture, cv2.resize(truth.rgb, (672, 448)))
+    np.testing.assert_array_equal(pool.frames[0].picture, cv2.resize(truth.rgb, PICTURE_SIZE))
     assert [thing.category for thing in pool.frames[0].objects] == [thing.category for thing in truth.objects]
     kept = [crop for crops in pool.crops.values() for crop in crops]
     assert kept

@@ -1,10 +1,11 @@
-"""One training loop for all street models: seeded, prefetched; the same seed gives the same weights."""
+"""One training loop for all street models: seeded, prefetched, resumable; the same seed gives the same weights."""
 
 import copy
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,14 @@ class FitSettings:
     name: str = "network"
 
 
-def fit(network: nn.Module, make_batch: BatchMaker, loss_of: LossFunction, settings: FitSettings) -> nn.Module:
+def fit(
+    network: nn.Module,
+    make_batch: BatchMaker,
+    loss_of: LossFunction,
+    settings: FitSettings,
+    *,
+    checkpoint: Path | None = None,
+) -> nn.Module:
     """Train ``network`` in place; the moving average of its weights is returned, ready for inference.
 
     Args:
@@ -43,6 +51,8 @@ def fit(network: nn.Module, make_batch: BatchMaker, loss_of: LossFunction, setti
             threads.
         loss_of: scalar loss of a network and a batch.
         settings: length and rates.
+        checkpoint: file that holds the state at every report. Where it is there already, training goes on from it, and
+            ends with the same weights as without a pause.
     """
     network.train()
     if settings.channels_last:
@@ -51,8 +61,10 @@ def fit(network: nn.Module, make_batch: BatchMaker, loss_of: LossFunction, setti
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=(0.9, 0.99)
     )
+    state = _State(network=network, average=average, optimiser=optimiser)
+    first = state.load(checkpoint) if checkpoint and checkpoint.is_file() else 0
     recent: list[float] = []
-    for step, batch in enumerate(_prefetched(make_batch, settings)):
+    for step, batch in enumerate(_prefetched(make_batch, settings, first=first), first):
         for group in optimiser.param_groups:
             group["lr"] = settings.learning_rate * rate_at(step, settings.steps)
         with torch.autocast("cpu", settings.precision, enabled=settings.precision != torch.float32):
@@ -66,6 +78,8 @@ def fit(network: nn.Module, make_batch: BatchMaker, loss_of: LossFunction, setti
         if (step + 1) % settings.report_every == 0:
             print(f"  {settings.name}: step {step + 1} of {settings.steps}, loss {np.mean(recent):.4f}", flush=True)
             recent.clear()
+            if checkpoint:
+                state.save(checkpoint, step + 1)
     return average.eval()
 
 
@@ -77,17 +91,40 @@ def rate_at(step: int, steps: int) -> float:
     return 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, steps - warm)))
 
 
-def _prefetched(make_batch: BatchMaker, settings: FitSettings, *, ahead: int = 3) -> Iterator[Any]:
+def _prefetched(make_batch: BatchMaker, settings: FitSettings, *, first: int = 0, ahead: int = 3) -> Iterator[Any]:
     def batch_of(step: int) -> Any:
         return make_batch(np.random.default_rng((settings.seed, step)))
 
     with ThreadPoolExecutor(1) as pool:
-        waiting = [pool.submit(batch_of, step) for step in range(min(ahead, settings.steps))]
-        for step in range(settings.steps):
+        waiting = [pool.submit(batch_of, step) for step in range(first, min(first + ahead, settings.steps))]
+        for step in range(first, settings.steps):
             batch = waiting.pop(0).result()
             if step + ahead < settings.steps:
                 waiting.append(pool.submit(batch_of, step + ahead))
             yield batch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _State:
+    """What training goes on from; no batch depends on anything but its step."""
+
+    network: nn.Module
+    average: nn.Module
+    optimiser: torch.optim.Optimizer
+
+    def save(self, path: Path, steps: int) -> None:
+        parts = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
+        scratch = path.with_suffix(".part")
+        torch.save({"steps": steps} | {name: part.state_dict() for name, part in parts.items()}, scratch)
+        scratch.replace(path)
+
+    def load(self, path: Path) -> int:
+        """Steps done."""
+        kept = torch.load(path, weights_only=True)
+        self.network.load_state_dict(kept["network"])
+        self.average.load_state_dict(kept["average"])
+        self.optimiser.load_state_dict(kept["optimiser"])
+        return int(kept["steps"])
 
 
 @torch.no_grad()

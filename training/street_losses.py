@@ -25,8 +25,9 @@ def detector_loss(rows: Tensor, classes: Tensor, boxes_xyxy: Tensor, cells: Tens
     halves = picked[:, 2:4].clamp(max=5).exp() * strides[cell, None] / 2
     overlap, generalised = _overlaps(torch.cat([centres - halves, centres + halves], dim=1), truth)
     objectness = torch.zeros_like(rows[..., 4])
-    # The overlap is the score that suppression ranks by: the best placed of an object's cells survives.
-    objectness[sample, cell] = overlap.detach().clamp(min=0.3)
+    # The overlap ranks an object's cells for suppression. Its root does so too, and is fairer to small objects, whose
+    # boxes are never exact.
+    objectness[sample, cell] = overlap.detach().clamp(min=0.25).sqrt()
     entropy = functional.binary_cross_entropy_with_logits(rows[..., 4], objectness, reduction="none")
     entropy = (entropy * (classes != _IGNORED)).sum() / count
     names = functional.one_hot(classes[sample, cell], rows.shape[2] - 5).float()
@@ -51,6 +52,8 @@ def simcc_loss(
     weights: Tensor,
     visible: Tensor,
     tolerance_bins: Tensor,
+    *,
+    hidden_weight: float = 1.0,
 ) -> Tensor:
     """Cross-entropy along each axis, and of the score: the probability that a point is seen *and* found.
 
@@ -60,6 +63,7 @@ def simcc_loss(
         weights: (N, K) of the points' places: 1 visible, less where hidden, 0 where unknown.
         visible: (N, K) 0 or 1.
         tolerance_bins: (N,) distance within which a point counts as found.
+        hidden_weight: of hidden points in the score's loss: above 1, a point in doubt scores lower than its chances.
     """
     total = weights.sum().clamp(min=1)
     loss = torch.zeros(())
@@ -68,7 +72,8 @@ def simcc_loss(
         loss = loss - ((response * logits.log_softmax(dim=2)).sum(dim=2) * weights).sum() / total
         off.append(logits.detach().argmax(dim=2) - response.argmax(dim=2))
     found = torch.hypot(off[0].float(), off[1].float()) <= tolerance_bins[:, None]
-    score = functional.binary_cross_entropy_with_logits(outputs[2], visible * found)
+    doubt = torch.where(visible > 0, 1.0, hidden_weight)
+    score = functional.binary_cross_entropy_with_logits(outputs[2], visible * found, weight=doubt)
     return loss + 2 * score
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from dataset.street import Street, StreetConfig, StreetFrame
 from labeling.schemas import Category
 
-PICTURE_SIZE = (672, 448)
-"""Width and height at which frames are kept: the detector's input; 7/11 of 1056x704."""
+PICTURE_SIZE = (768, 512)
+"""Width and height at which frames are kept: the detector's input; 8/11 of 1056x704."""
 CROP_MARGIN = 1.8
 """Side of a stored crop relative to the object's box, so that it can still be moved, turned and scaled."""
 CROP_LIMIT_PX = 360
@@ -48,7 +48,7 @@ class PoolFrame:
     """One frame, scaled down, with its truth at full size."""
 
     picture: np.ndarray
-    """(448, 672, 3) uint8 RGB."""
+    """(512, 768, 3) uint8 RGB."""
     scale: float
     """Picture pixels per frame pixel."""
     objects: tuple[ObjectTruth, ...]
