@@ -1,18 +1,21 @@
-"""Points carried from frame to frame by optical flow, with a check that says when they cannot be.
+"""Points carried by optical flow between two looks, with a check that says when they cannot be.
 
 Sparse Lucas-Kanade on half-size grey pictures, forward and backward (Kalal et al. 2010: what does not come back to
-where it started was not followed). An object is followed as a whole: points that lost their ground move with the rest.
+where it started was not followed). An object is followed as a whole, by a few of its points; someone's limbs are
+followed each for itself as well, and a joint that lost its ground moves with the rest.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
 
 from labeling.labels import POINT_ABSENT, POINT_CARRIED, POINT_INTERPOLATED, Keypoints
-from labeling.schemas import Category
+from labeling.medians import masked_median
 
-_WINDOW = (13, 13)
+_WINDOW = (11, 11)
 _LEVELS = 3
 _MAX_RETURN_PX = 0.7
 """Half-size pixels by which a point may miss its start after going there and back."""
@@ -20,10 +23,20 @@ _MIN_FOLLOWED_SHARE = 0.4
 """An object of which less is followed is lost."""
 _MIN_CORNERS = 4
 """Points on an even surface follow nothing: an object needs this many that return."""
-_SLACK: dict[Category, float] = {"car": 0.01, "person": 0.04, "lane": 0.01}
-"""Share of the box diagonal by which a point's own flow may differ from the object's in one frame: limbs swing."""
+_RIGID_POINTS = 12
+"""As many keypoints of what does not bend are followed: the cost of flow goes with the number of points."""
+_LIMB_SLACK = 0.04
+"""Share of the box diagonal by which a joint's own flow may differ from the body's in one frame: limbs swing."""
 _MAX_CLOSING = 0.15
 """Share of the box diagonal by which a carried point may miss its next detection before the flow is not believed."""
+UNSEEN_FRAMES = 6
+"""Nothing is shown that was not seen within a quarter of a second."""
+
+
+_FEW, _MANY = (
+    np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    for places in (np.linspace(0.25, 0.75, 3), np.linspace(0.2, 0.8, 4))
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,8 +54,8 @@ def small_grey(frame: np.ndarray) -> np.ndarray:
     return cv2.resize(grey, (grey.shape[1] // 2, grey.shape[0] // 2), interpolation=cv2.INTER_AREA)
 
 
-def carry(previous: np.ndarray, current: np.ndarray, labels: list[Keypoints], *, frame: int) -> list[Carried]:
-    """Objects moved from one frame into its neighbour, before or after.
+def carry(previous: np.ndarray, current: np.ndarray, labels: Sequence[Keypoints], *, frame: int) -> list[Carried]:
+    """Objects moved from one frame into one of its next neighbours, before or after.
 
     Args:
         previous: (h, w) uint8, ``small_grey`` of the frame that ``labels`` belong to.
@@ -50,53 +63,68 @@ def carry(previous: np.ndarray, current: np.ndarray, labels: list[Keypoints], *,
         labels: objects with some present points, or a box alone (whose corners' inside is then followed).
         frame: grid number of the frame to carry into.
     """
-    starts = [_points_to_follow(label) for label in labels]
     if not labels:
         return []
-    moved, returned = _follow(previous, current, np.concatenate(starts))
-    ends = np.cumsum([len(start) for start in starts])[:-1]
-    carried = []
-    for label, start, end, good in zip(labels, starts, np.split(moved, ends), np.split(returned, ends), strict=True):
-        carried.append(_moved(label, start, end, good, frame=frame))
-    return carried
+    starts = [_points_to_follow(label) for label in labels]
+    counts = np.array([len(start) for start in starts])
+    used = np.arange(counts.max()) < counts[:, None]
+    start, end = np.zeros((*used.shape, 2), np.float32), np.zeros((*used.shape, 2), np.float32)
+    good = np.zeros(used.shape, bool)
+    start[used] = np.concatenate(starts)
+    end[used], good[used] = _follow(previous, current, start[used])
+    scales, shifts = _shared_motion(start, end, good)
+    followed = (good.sum(axis=1) >= _MIN_CORNERS) & (good.sum(axis=1) >= _MIN_FOLLOWED_SHARE * counts)
+    return [
+        Carried(
+            label=_moved(label, float(scales[i]), shifts[i], end[i], good[i], frame=frame), followed=bool(followed[i])
+        )
+        for i, label in enumerate(labels)
+    ]
 
 
-def close_gap(path: list[Keypoints], end: Keypoints) -> list[Keypoints]:
+def close_gap(path: Sequence[Keypoints], end: Keypoints) -> list[Keypoints]:
     """A carried object, corrected by where it was next detected.
 
     What was missed at the end is spread evenly over the way, so that the path meets both detections. A point that was
-    missed by far was not followed: it is interpolated between the detections instead. A point that only one end knows
-    is left as carried, or absent.
+    missed by far was not followed: it is interpolated between the detections instead. A point that only the first end
+    knows is left as carried for as long as it may be shown; one that only the other knows is absent.
 
     Args:
-        path: the object at the first detection, then in every frame up to the last before ``end``, then carried into
-            ``end``'s own frame: G + 1 labels for a gap of G frames.
+        path: the object at the first detection, then wherever it was carried to, last into ``end``'s own frame.
         end: the same object as detected there.
 
     Returns:
-        The G - 1 labels between the detections.
+        A label for every frame between the detections; those that the path passes over are interpolated.
     """
     start, arrived = path[0], path[-1]
+    gap = end.frame - start.frame
     miss = end.points[:, :2] - arrived.points[:, :2]
     both = start.present & end.present
     believed = both & arrived.present & (np.linalg.norm(miss, axis=1) <= _MAX_CLOSING * box_diagonal(end.box_xyxy))
-    out = []
-    for step, label in enumerate(path[1:-1], start=1):
-        share = np.float32(step / (len(path) - 1))
+    rough = both & ~believed
+    nodes = [start]
+    for label in path[1:-1]:
+        share = np.float32((label.frame - start.frame) / gap)
         points, source = label.points.copy(), label.point_source.copy()
         points[believed, :2] += share * miss[believed]
-        rough = both & ~believed
         points[rough] = (1 - share) * start.points[rough] + share * end.points[rough]
         points[both, 2] = np.minimum(start.points[both, 2], end.points[both, 2])
         source[rough] = POINT_INTERPOLATED
+        if label.frame - start.frame > UNSEEN_FRAMES:
+            points[~both], source[~both] = 0, POINT_ABSENT
         box = label.box_xyxy + share * (end.box_xyxy - arrived.box_xyxy)
         score = float((1 - share) * start.score + share * end.score)
-        out.append(replace(label, points=points, point_source=source, box_xyxy=box, score=score))
-    return out
+        nodes.append(replace(label, points=points, point_source=source, box_xyxy=box, score=score))
+    return along_path([*nodes, end])[:-1]
+
+
+def along_path(path: Sequence[Keypoints]) -> list[Keypoints]:
+    """The labels of a path after its first, those between its nodes interpolated."""
+    return [label for a, b in pairwise(path) for label in (*interpolate_gap(a, b), b)]
 
 
 def interpolate_gap(start: Keypoints, end: Keypoints) -> list[Keypoints]:
-    """The labels between two detections of one object, on straight lines; points that only one knows are absent."""
+    """The labels between two labels of one object, on straight lines; points that only one knows are absent."""
     gap = end.frame - start.frame
     both = start.present & end.present
     out = []
@@ -121,11 +149,13 @@ def box_diagonal(box_xyxy: np.ndarray) -> float:
 
 
 def _points_to_follow(label: Keypoints) -> np.ndarray:
-    """(N, 2) float32 full-size pixels: the present points, and a grid inside the box that helps when they are few."""
+    """(N, 2) float32 full-size pixels: present points, and a grid inside the box that helps when they are few."""
     left, top, right, bottom = label.box_xyxy
-    columns, rows = np.meshgrid(np.linspace(0.2, 0.8, 4), np.linspace(0.2, 0.8, 4))
-    grid = np.stack([left + columns * (right - left), top + rows * (bottom - top)], axis=-1).reshape(-1, 2)
-    return np.concatenate([label.points[label.present, :2], grid]).astype(np.float32)
+    own = label.points[label.present, :2]
+    if label.category != "person":
+        own = own[:: max(1, -(-len(own) // _RIGID_POINTS))]
+    grid = _FEW if len(own) > _MIN_CORNERS else _MANY
+    return np.concatenate([own, (left, top) + grid * (right - left, bottom - top)]).astype(np.float32)
 
 
 def _follow(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,30 +172,41 @@ def _follow(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> tu
     return there[:, 0] * 2 + 0.5, good & inside
 
 
-def _moved(label: Keypoints, start: np.ndarray, end: np.ndarray, good: np.ndarray, *, frame: int) -> Carried:
-    count = int(label.present.sum())
-    followed = good.sum() >= _MIN_CORNERS and good.mean() >= _MIN_FOLLOWED_SHARE
-    scale, shift = _scale_and_shift(start[good], end[good]) if good.sum() >= 2 else (1.0, np.zeros(2))
-    modelled = start * scale + shift
-    # A point that slipped along an edge returns to its start and is wrong all the same: the object's motion bounds it.
-    slack = _SLACK[label.category] * box_diagonal(label.box_xyxy) + 0.25
-    trusted = good & (np.linalg.norm(end - modelled, axis=1) <= slack)
-    new = np.where(trusted[:, None], end, modelled).astype(np.float32)
+def _shared_motion(start: np.ndarray, end: np.ndarray, good: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The motion ``end = scale start + shift`` that most of each object's points share: medians, half may err.
+
+    Args:
+        start: (N, P, 2).
+        end: (N, P, 2).
+        good: (N, P) bool: which to trust; an object with fewer than two stays where it is.
+
+    Returns:
+        (N,) scales, and (N, 2) shifts.
+    """
+    arms = start - masked_median(start, good)[:, None]
+    moved_arms = end - masked_median(end, good)[:, None]
+    lengths = np.linalg.norm(arms, axis=2)
+    far = good & (lengths > masked_median(lengths, good)[:, None])
+    ratios = (arms * moved_arms).sum(axis=2) / np.maximum(lengths**2, 1e-9)
+    scales = np.where(far.any(axis=1), np.clip(masked_median(ratios, far), 0.8, 1.25), 1.0)
+    shifts = masked_median(end - scales[:, None, None] * start, good)
+    still = good.sum(axis=1) < 2
+    scales[still], shifts[still] = 1.0, 0.0
+    return scales, shifts
+
+
+def _moved(
+    label: Keypoints, scale: float, shift: np.ndarray, end: np.ndarray, good: np.ndarray, *, frame: int
+) -> Keypoints:
     points, source = label.points.copy(), label.point_source.copy()
-    points[label.present, :2] = new[:count]
-    source[label.present] = POINT_CARRIED
+    present = label.present
+    count = int(present.sum())
+    points[present, :2] = points[present, :2] * scale + shift
+    if label.category == "person":
+        # A joint that slipped along an edge returns to its start and is wrong all the same: the body bounds it.
+        slack = _LIMB_SLACK * abs(frame - label.frame) * box_diagonal(label.box_xyxy) + 0.25
+        own = good[:count] & (np.linalg.norm(end[:count] - points[present, :2], axis=1) <= slack)
+        points[np.flatnonzero(present)[own], :2] = end[:count][own]
+    source[present] = POINT_CARRIED
     box = (label.box_xyxy.reshape(2, 2) * scale + shift).reshape(4).astype(np.float32)
-    return Carried(
-        label=replace(label, frame=frame, points=points, point_source=source, box_xyxy=box), followed=bool(followed)
-    )
-
-
-def _scale_and_shift(start: np.ndarray, end: np.ndarray) -> tuple[float, np.ndarray]:
-    """The motion ``end = scale start + shift`` that most points share: medians, so that half of them may err."""
-    middle = np.median(start, axis=0)
-    arms, moved_arms = start - middle, end - np.median(end, axis=0)
-    lengths = np.linalg.norm(arms, axis=1)
-    far = lengths > np.median(lengths)
-    ratio = np.median((arms[far] * moved_arms[far]).sum(axis=1) / (lengths[far] ** 2)) if far.any() else 1.0
-    scale = float(np.clip(ratio, 0.8, 1.25))
-    return scale, np.median(end - scale * start, axis=0)
+    return replace(label, frame=frame, points=points, point_source=source, box_xyxy=box)

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from labeling.carrying import box_diagonal, carry, close_gap, interpolate_gap, small_grey
+from labeling.carrying import UNSEEN_FRAMES, along_path, box_diagonal, carry, close_gap, interpolate_gap, small_grey
 from labeling.extractors import Extractors
 from labeling.labels import Keypoints
 from labeling.observation import Look, looks_of
@@ -31,28 +31,34 @@ class EffortSettings:
     """Longest time between two looks: half a second at most, so that nothing is shown that was not seen 0.25 s away."""
     max_person_gap: int
     """The same while someone walks: legs swing at about 1 Hz and do not go straight."""
+    max_lane_gap: int
+    """The same for lane lines, which have no points to follow."""
+    flow_step: int = 1
+    """Frames between two steps of the optical flow that carries points; 0 for none: points go straight then."""
     max_bend: float = 0.03
-    """Share of its size by which an object's growth may depart from a straight line between two looks."""
+    """Share of its size by which an object's growth may depart from a straight line where no flow follows it."""
     max_miss: float = 0.03
     """Share of the box diagonal by which carried points may miss the next look before looks come closer together."""
-    flow: bool = True
-    """Carry points by optical flow; else they go straight from look to look."""
     quiet_frames: int = 24
     """A network that has seen nothing for so long looks only every ``quiet_gap`` frames."""
     quiet_gap: int = 12
 
 
 EFFORTS: dict[Effort, EffortSettings] = {
-    "exact": EffortSettings(max_gap=1, max_person_gap=1, quiet_gap=1),
-    "balanced": EffortSettings(max_gap=6, max_person_gap=4),
-    "fast": EffortSettings(max_gap=12, max_person_gap=6, max_bend=0.05, max_miss=0.05),
+    "exact": EffortSettings(max_gap=1, max_person_gap=1, max_lane_gap=1, flow_step=0, quiet_gap=1),
+    "balanced": EffortSettings(max_gap=8, max_person_gap=4, max_lane_gap=12, flow_step=2),
+    "fast": EffortSettings(max_gap=12, max_person_gap=8, max_lane_gap=12, flow_step=3, max_bend=0.05, max_miss=0.05),
 }
 
-_WAITING_GAP = 4
+_WAITING_GAP = 6
 """While nothing has been seen for a moment only."""
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
 """What lasts less than a quarter of a second, or was seen once, is taken for a mistake."""
+_NEAR_PX = 48.0
+"""Objects at least this high bring looks closer together when they come or go; what is far may be seen later."""
+_BORDER_PX = 4.0
+"""What is nearer to the picture's border is expected to leave it."""
 
 
 def label_frames(
@@ -132,39 +138,59 @@ class _Channel:
         self._key: list[Keypoints] = []
         self._key_frame: int | None = None
         self._paths: dict[int, list[Keypoints]] = {}
-        self._previous: Callable[[], np.ndarray] | None = None
-        self._latest: tuple[np.ndarray, int] | None = None
+        self._grey: tuple[np.ndarray, int] | None = None
+        self._latest: tuple[np.ndarray, Callable[[], np.ndarray], int] | None = None
+        self._slippery: set[int] = set()
         self._gap = 1
         self._last_seen: int | None = None
+
+    @property
+    def _flows(self) -> bool:
+        return self.look.carries and self.settings.flow_step > 0
 
     def push(self, frame: np.ndarray, grey: Callable[[], np.ndarray], *, number: int, fresh: bool) -> None:
         """The next frame of the run; ``fresh`` when nothing of the one before it holds any more."""
         if fresh:
             self.finish()
             self._forget()
-        healthy = self._carry(grey, number)
-        if self._key_frame is None or number - self._key_frame >= self._gap or not healthy:
-            self._look(frame, number)
-        self._previous, self._latest = grey, (frame, number)
+        self._latest = (frame, grey, number)
+        due = self._key_frame is None or number - self._key_frame >= self._gap
+        if due or not self._carry(grey, number):
+            self._look(frame, grey, number)
 
     def finish(self) -> None:
         """The run, or what came before a cut, ends: its last frame is looked at, so that nothing carried stays open."""
-        if self._latest and self._latest[1] != self._key_frame:
+        if self._latest and self._latest[2] != self._key_frame:
             self._look(*self._latest)
 
-    def _carry(self, grey: Callable[[], np.ndarray], number: int) -> bool:
-        """Carry the last look's objects into this frame; False when one of them was lost on the way."""
-        if not (self.settings.flow and self.look.carries and self._paths and self._previous):
+    def _carry(self, grey: Callable[[], np.ndarray], number: int, *, arriving: bool = False) -> bool:
+        """Carry the last look's objects on where a step is due; False when one of them was lost on the way."""
+        if not self._grey or not self._paths:
             return True
-        if self.settings.max_gap == 1:
+        previous, since = self._grey
+        if number - since < (1 if arriving else self.settings.flow_step):
             return True
-        latest = [path[-1] for path in self._paths.values()]
-        carried = carry(self._previous(), grey(), latest, frame=number)
+        carried = carry(previous, grey(), [path[-1] for path in self._paths.values()], frame=number)
+        self._grey = (grey(), number)
         for path, moved in zip(self._paths.values(), carried, strict=True):
             path.append(moved.label)
-        return all(moved.followed for moved in carried)
+        if arriving:
+            return True
+        lost = {moved.label.track_id for moved in carried if not moved.followed} - self._slippery
+        height, width = (2 * side for side in previous.shape)
+        inside = [
+            moved.label.track_id
+            for moved in carried
+            if (moved.label.box_xyxy[:2] > _BORDER_PX).all()
+            and (moved.label.box_xyxy[2:] < np.array([width, height]) - _BORDER_PX).all()
+        ]
+        # Flow that loses what the next look finds again has nothing to hold on to there: it is not asked again.
+        self._slippery |= lost
+        return not lost & set(inside)
 
-    def _look(self, frame: np.ndarray, number: int) -> None:
+    def _look(self, frame: np.ndarray, grey: Callable[[], np.ndarray], number: int) -> None:
+        if self._key_frame is not None and number - self._key_frame > 1:
+            self._carry(grey, number, arriving=True)
         seen = self._tracker.update(self.look.see(frame, number), frame=number)
         self.looks += 1
         miss = self._close(seen, number)
@@ -174,17 +200,19 @@ class _Channel:
         self._gap = self._next_gap(seen, miss, number)
         self._key, self._key_frame = seen, number
         self._paths = {label.track_id: [label] for label in seen}
+        self._grey = (grey(), number) if self._flows and self._gap > 1 and seen else None
 
     def _close(self, seen: list[Keypoints], number: int) -> float:
         """Labels between the last look and this one; returns the median miss of carried points, in box diagonals."""
         now = {label.track_id: label for label in seen}
         misses = []
         for label in self._key:
-            path, end = self._paths.get(label.track_id, [label]), now.get(label.track_id)
+            path, end = self._paths[label.track_id], now.get(label.track_id)
             if end is None:
                 # Lost from sight: kept for as long as flow may be believed without a second look.
-                self.labels += [step for step in path[1:] if step.frame < number][: self.settings.max_gap // 2]
-            elif len(path) == number - label.frame + 1 and len(path) > 2:
+                limit = min(number - 1, label.frame + min(self.settings.max_gap // 2, UNSEEN_FRAMES))
+                self.labels += [step for step in along_path(path) if step.frame <= limit]
+            elif len(path) > 1 and path[-1].frame == number:
                 misses.append(_miss(path[-1], end))
                 self.labels += close_gap(path, end)
             else:
@@ -192,19 +220,28 @@ class _Channel:
         return float(np.median(misses)) if misses else 0.0
 
     def _next_gap(self, seen: list[Keypoints], miss: float, number: int) -> int:
+        settings = self.settings
         if not seen:
-            quiet = number - (self._last_seen or 0) >= self.settings.quiet_frames
-            return self.settings.quiet_gap if quiet else min(self.settings.max_gap, _WAITING_GAP)
+            quiet = number - (self._last_seen or 0) >= settings.quiet_frames
+            return settings.quiet_gap if quiet else min(settings.max_gap, _WAITING_GAP)
+        gap = float(self._gap + 2 if miss <= settings.max_miss else self._gap // 2)
         before = {label.track_id: label for label in self._key}
-        gap = float(min(self.settings.max_gap, self._gap + 2 if miss <= self.settings.max_miss else self._gap // 2))
-        if set(before) != {label.track_id for label in seen}:
-            gap = min(gap, max(1, self.settings.max_gap // 2))
+        now = {label.track_id: label for label in seen}
+        near = [i for i in set(before) ^ set(now) if _height(now.get(i) or before[i]) >= _NEAR_PX]
+        if near:
+            gap = min(gap, settings.max_gap // 2)
         for label in seen:
-            if label.category == "person":
-                gap = min(gap, self.settings.max_person_gap)
-            if label.track_id in before:
-                gap = min(gap, straight_gap(before[label.track_id], label, max_bend=self.settings.max_bend))
+            gap = min(gap, self._longest_gap(label, before.get(label.track_id)))
         return max(1, int(gap))
+
+    def _longest_gap(self, label: Keypoints, before: Keypoints | None) -> float:
+        """How long one object may go without a look."""
+        if label.category == "lane":
+            return self.settings.max_lane_gap
+        longest = self.settings.max_person_gap if label.category == "person" else self.settings.max_gap
+        if self._flows or before is None:
+            return longest
+        return min(longest, straight_gap(before, label, max_bend=self.settings.max_bend))
 
 
 def straight_gap(before: Keypoints, after: Keypoints, *, max_bend: float) -> float:
@@ -212,6 +249,10 @@ def straight_gap(before: Keypoints, after: Keypoints, *, max_bend: float) -> flo
     frames = after.frame - before.frame
     rate = abs(math.log(box_diagonal(after.box_xyxy) / box_diagonal(before.box_xyxy))) / max(1, frames)
     return math.sqrt(4 * max_bend) / rate if rate > 0 else math.inf
+
+
+def _height(label: Keypoints) -> float:
+    return float(label.box_xyxy[3] - label.box_xyxy[1])
 
 
 def _miss(carried: Keypoints, seen: Keypoints) -> float:

@@ -9,9 +9,11 @@ a narrow fit agree within the noise the wide one is taken, which is how a parked
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 
 from labeling.labels import POINT_INTERPOLATED, Keypoints
+from labeling.medians import masked_median
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +79,7 @@ def _smooth_track(group: list[Keypoints], settings: SmoothingSettings) -> list[K
     corners[..., :2] = smooth_series(corners, settings)
     return [
         replace(
-            group[0], frame=first + row, score=float(scores[row]),
+            group[0], frame=int(first + row), score=float(scores[row]),
             box_xyxy=corners[row, :, :2].reshape(4).astype(np.float32),
             points=points[row].astype(np.float32), point_source=source[row],
         )
@@ -121,13 +123,14 @@ def smooth_series(points: np.ndarray, settings: SmoothingSettings) -> np.ndarray
     """
     present = points[..., 2] > 0
     positions, weights = points[..., :2], np.where(present, np.maximum(points[..., 2], 0.05), 0)
-    narrow = _local_fit(positions, weights, half_width=settings.narrow)
-    wide = _local_fit(positions, weights, half_width=settings.wide)
+    positions = np.ascontiguousarray(positions, np.float64)
+    narrow = _local_fit(positions, weights, settings.narrow)
+    wide = _local_fit(positions, weights, settings.wide)
     residual = np.linalg.norm(positions - narrow, axis=-1)
     gap = np.linalg.norm(wide - narrow, axis=-1)
     # One window for the whole object, since its points move together; the noise is each object's own.
     sigma = np.median(residual[present]) if present.any() else 0.0
-    object_gap = np.array([np.median(row[seen]) if seen.any() else 0.0 for row, seen in zip(gap, present, strict=True)])
+    object_gap = masked_median(gap, present)
     share = np.clip(2 - object_gap / max(settings.agreement * sigma, 1e-6), 0, 1)[:, None, None]
     # A point that bends while its object does not (a foot of someone who stands) keeps the narrow fit.
     bends = np.clip(2 - gap / max(3 * settings.agreement * sigma, 1e-6), 0, 1)[..., None]
@@ -135,24 +138,40 @@ def smooth_series(points: np.ndarray, settings: SmoothingSettings) -> np.ndarray
     return np.where(present[..., None], blend * wide + (1 - blend) * narrow, positions)
 
 
-def _local_fit(positions: np.ndarray, weights: np.ndarray, *, half_width: int) -> np.ndarray:
-    """(T, K, 2) values at each frame of quadratics fitted by tricube-weighted least squares around it."""
-    length = len(positions)
-    moments = np.zeros((5, *weights.shape))
-    targets = np.zeros((3, *positions.shape))
-    for offset in range(-half_width, half_width + 1):
-        if abs(offset) >= length:
-            continue
-        u = offset / (half_width + 1)
-        here = slice(max(0, -offset), length - max(0, offset))
-        there = slice(max(0, offset), length - max(0, -offset))
-        w = weights[there] * (1 - abs(u) ** 3) ** 3
-        for power in range(5):
-            moments[power, here] += w * u**power
-        for power in range(3):
-            targets[power, here] += (w * u**power)[..., None] * positions[there]
-    # A little ridge on slope and bend: with too few frames for them (the ends of a track) the fit falls back to a mean.
-    normal = np.stack([np.stack([moments[i + j] for j in range(3)], axis=-1) for i in range(3)], axis=-2)
-    normal = normal + np.diag([1e-9, 1e-3, 2e-3])
-    solution = np.linalg.solve(normal, np.moveaxis(targets, 0, -2))
-    return solution[..., 0, :]
+@numba.njit(cache=True)
+def _local_fit(positions, weights, half_width):
+    """(T, K, 2) values at each frame of quadratics fitted by tricube-weighted least squares around it.
+
+    Args:
+        positions: (T, K, 2) float64.
+        weights: (T, K) float64, 0 for what is absent.
+        half_width: frames on either side.
+    """
+    length, count, _ = positions.shape
+    fitted = np.zeros_like(positions)
+    for t in range(length):
+        first, last = max(0, t - half_width), min(length - 1, t + half_width)
+        for k in range(count):
+            m0 = m1 = m2 = m3 = m4 = 0.0
+            x0 = x1 = x2 = y0 = y1 = y2 = 0.0
+            for s in range(first, last + 1):
+                u = (s - t) / (half_width + 1)
+                w = weights[s, k] * (1 - abs(u) ** 3) ** 3
+                wu = w * u
+                wuu = wu * u
+                m0 += w
+                m1 += wu
+                m2 += wuu
+                m3 += wuu * u
+                m4 += wuu * u * u
+                x, y = positions[s, k, 0], positions[s, k, 1]
+                x0, x1, x2 = x0 + w * x, x1 + wu * x, x2 + wuu * x
+                y0, y1, y2 = y0 + w * y, y1 + wu * y, y2 + wuu * y
+            # A little ridge on slope and bend: with too few frames for them (the ends of a track) the fit falls back to
+            # a mean. The first unknown of the normal equations by Cramer's rule.
+            a, d, f = m0 + 1e-9, m2 + 1e-3, m4 + 2e-3
+            c0, c1, c2 = d * f - m3 * m3, m2 * m3 - m1 * f, m1 * m3 - m2 * d
+            determinant = a * c0 + m1 * c1 + m2 * c2
+            fitted[t, k, 0] = (c0 * x0 + c1 * x1 + c2 * x2) / determinant
+            fitted[t, k, 1] = (c0 * y0 + c1 * y1 + c2 * y2) / determinant
+    return fitted

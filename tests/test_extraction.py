@@ -83,8 +83,24 @@ def test_sources_say_what_was_seen_and_what_carried() -> None:
     scene = MovingCard()
     labels = label_with([scene], (scene.render(t) for t in range(40)), first_frame=0, effort="balanced")
     for label in labels:
-        expected = POINT_DETECTED if label.frame in scene.seen else POINT_CARRIED
-        assert (label.point_source == expected).mean() > 0.9, label.frame
+        seen = label.frame in scene.seen
+        expected = (POINT_DETECTED,) if seen else (POINT_CARRIED, POINT_INTERPOLATED)
+        assert np.isin(label.point_source, expected).mean() > 0.9, label.frame
+    carried = [label.frame for label in labels if (label.point_source == POINT_CARRIED).all()]
+    # Flow takes every second frame; what lies between its steps is interpolated.
+    assert len(carried) >= (40 - len(scene.seen)) / 2 - len(scene.seen) / 2
+
+
+def test_nothing_is_shown_long_after_it_was_seen() -> None:
+    """A point that only the first look knows, half a second before the next: gone after a quarter of a second."""
+    scene = MovingCard(speed=1.0)
+    path = [scene.label(frame) for frame in range(0, 13, 3)]
+    end = scene.label(12)
+    end.points[:12], end.point_source[:12] = 0, 0
+    labels = close_gap(path, end)
+    assert [label.frame for label in labels] == list(range(1, 12))
+    assert [bool(label.points[0, 2] > 0) for label in labels] == [True] * 6 + [False] * 5
+    assert all(label.points[23, 2] > 0 for label in labels)
 
 
 def test_the_last_frame_is_looked_at() -> None:
