@@ -101,21 +101,23 @@ class ClipScore:
 
 
 def score_clip(
-    truth: ClipTruth, sets: Mapping[str, Sequence[SampleEstimate]], *, seconds: float | None = None
-) -> dict[str, ClipScore]:
+    truth: ClipTruth, sets: Mapping[str, Sequence[SampleEstimate]], *, seconds: float | None = None,
+    floor: str | None = None,
+) -> dict[str, ClipScore]:  # fmt: skip
     """Figures of each set of samples of one clip, all on the duration that they have in common.
 
     Args:
         truth: the clip.
         sets: samples by the set's name (what is judged, its noise floor, baselines).
         seconds: compare no more than this.
+        floor: the set that looks at the truth's own video; its APD is that of its one trajectory and the truth.
 
     Returns:
         By set. A set without samples has a score without values.
     """
     end_s = common_seconds(truth, [one for samples in sets.values() for one in samples], seconds=seconds)
     grid = truth.times_s[truth.times_s <= end_s + 1e-6]
-    return {name: _score_set(truth, samples, grid) for name, samples in sets.items()}
+    return {name: _score_set(truth, samples, grid, is_floor=name == floor) for name, samples in sets.items()}
 
 
 def common_seconds(truth: ClipTruth, samples: Sequence[SampleEstimate], *, seconds: float | None = None) -> float:
@@ -244,7 +246,7 @@ def poses_at(times_s: np.ndarray, cam_to_world: np.ndarray, grid_s: np.ndarray) 
     return resample(rebased_trajectory(times_s, cam_to_world), inside).cam_to_world
 
 
-def _score_set(truth: ClipTruth, samples: Sequence[SampleEstimate], grid: np.ndarray) -> ClipScore:
+def _score_set(truth: ClipTruth, samples: Sequence[SampleEstimate], grid: np.ndarray, *, is_floor: bool) -> ClipScore:
     end_s = float(grid[-1])
     asked = truth.cam_to_world if truth.ego_condition is None else truth.ego_condition
     rows: list[dict[str, float]] = []
@@ -257,7 +259,10 @@ def _score_set(truth: ClipTruth, samples: Sequence[SampleEstimate], grid: np.nda
         rows.append(row)
     values, counts = _means(rows)
     if paths:
-        together = trajectory_scores(paths, truth.cam_to_world[: len(grid)])
+        true = truth.cam_to_world[: len(grid)]
+        together = trajectory_scores(paths, true)
+        if is_floor:
+            together["apd_m"] = apd_m([paths[0], true])
         values |= together
         counts |= dict.fromkeys(together, len(paths))
     return ClipScore(
