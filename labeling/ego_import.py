@@ -1,59 +1,142 @@
-"""Trajectories from elsewhere (GPS and IMU, a SLAM system, a learned model) in place of estimated ones."""
+"""Trajectories from elsewhere (GPS and IMU, a SLAM system, a learned model) in place of estimated ones.
 
+A file covers a video: TUM rows (``timestamp_s tx ty tz qx qy qz qw``) bring their times, KITTI rows (3x4 row-major)
+stand for the video's own frames or come at a rate. Camera to world, metres, OpenCV axes. Times are seconds from the
+video's first frame, once the file's offset is taken away.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from labeling.camera import Intrinsics, Trajectory, prior_intrinsics, read_kitti, read_tum, resample
+from labeling.camera import Intrinsics, Trajectory, read_kitti, read_tum, rebased_trajectory, resample
 from labeling.ego_motion import EgoMotion, RoadView
 from labeling.errors import TrajectoryError
 
 TrajectoryFormat = Literal["tum", "kitti"]
+MISSING = "missing"
+"""Mode of a frame that the file says nothing about."""
+
+_COLUMNS: dict[int, TrajectoryFormat] = {8: "tum", 12: "kitti"}
 _LONGEST_GAP_S = 0.25
 _STILL_M_S, _TURNING_RAD_S = 0.05, 0.01
 
 
-def import_trajectory(
-    path: Path,
-    format: TrajectoryFormat,
-    times_s: np.ndarray,
-    *,
-    fps: float = 24.0,
-    intrinsics: Intrinsics | None = None,
-    camera_height_m: float = 1.5,
-) -> EgoMotion:
-    """A run's ego-motion from a file: camera to world, metres, OpenCV axes.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileClock:
+    """What a file's times mean."""
 
-    A TUM file brings its own times, of the same clock as ``times_s``, and is resampled to them. A KITTI file has a row
-    for each frame of the run.
+    offset_s: float = 0.0
+    """The file's time at the video's first frame."""
+    fps: float | None = None
+    """Rate of a KITTI file's rows, the first at the file's time 0; None: they are the video's frames, and the offset
+    says nothing."""
 
-    Args:
-        path: the file.
-        format: tum (``timestamp_s tx ty tz qx qy qz qw``) or kitti (3x4 row-major).
-        times_s: (T,) times of the run's frames, increasing.
-        fps: of a KITTI file's rows, for messages about its length in seconds.
-        intrinsics: of the run's pictures, kept with the result.
-        camera_height_m: kept with the result.
+
+def trajectory_format(path: Path) -> TrajectoryFormat:
+    """The format of a file, by the numbers in its first row.
 
     Raises:
-        TrajectoryError: not rotations, time that runs backwards, gaps of more than a quarter second, or another span
-            or length than the run's.
+        TrajectoryError: it cannot be read, or has neither 8 nor 12 numbers a row.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrajectoryError(f"{path}: cannot be read as a trajectory ({error}); give a TUM or KITTI file") from error
+    rows = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    count = len(rows[0]) if rows else 0
+    if count not in _COLUMNS:
+        raise TrajectoryError(
+            f"{path}: has {count} numbers in its first row; give 8 (TUM: timestamp_s tx ty tz qx qy qz qw) or 12 "
+            "(KITTI: a 3x4 matrix)"
+        )
+    return _COLUMNS[count]
+
+
+def read_drive(path: Path, *, video_times_s: np.ndarray | None, clock: FileClock | None = None) -> Trajectory:
+    """A file's trajectory on the clock of a video, re-based to its first row.
+
+    Args:
+        path: a TUM or KITTI file.
+        video_times_s: (N,) times of the video's own frames, seconds from the first; None where they are not known.
+        clock: what the file's times mean.
+
+    Raises:
+        TrajectoryError: not rotations, time that runs backwards, rows that are no numbers, a KITTI file of another
+            length than the video, or a file that says nothing about any of the video.
+    """
+    clock = clock or FileClock()
+    try:
+        if trajectory_format(path) == "tum":
+            trajectory = read_tum(path)
+            times = trajectory.timestamps_s - clock.offset_s
+        else:
+            trajectory = read_kitti(path, fps=clock.fps or 1.0)
+            times = _row_times(len(trajectory), video_times_s, clock)
+        trajectory = Trajectory(timestamps_s=times, cam_to_world=trajectory.cam_to_world)
+    except (TrajectoryError, ValueError) as error:
+        text = str(error)
+        raise TrajectoryError(text if text.startswith(str(path)) else f"{path}: {text}") from error
+    _check_overlap(path, times, video_times_s)
+    return trajectory
+
+
+def _row_times(count: int, video_times_s: np.ndarray | None, clock: FileClock) -> np.ndarray:
+    if clock.fps is not None:
+        return np.arange(count) / clock.fps - clock.offset_s
+    if video_times_s is None:
+        raise TrajectoryError("a KITTI file carries no times; say its rate in rows a second, or index the video first")
+    if count != len(video_times_s):
+        raise TrajectoryError(
+            f"{count} rows for a video of {len(video_times_s)} frames; give a row for each frame, say the rows' rate, "
+            "or give a TUM file with times"
+        )
+    return np.asarray(video_times_s, dtype=np.float64)
+
+
+def _check_overlap(path: Path, times_s: np.ndarray, video_times_s: np.ndarray | None) -> None:
+    if video_times_s is None or len(video_times_s) == 0:
+        return
+    if times_s[-1] < 0 or times_s[0] > video_times_s[-1]:
+        raise TrajectoryError(
+            f"{path}: covers {times_s[0]:g} to {times_s[-1]:g} s of a video of {video_times_s[-1]:g} s, so none of it; "
+            "times count from the video's first frame: say the file's time then as its offset"
+        )
+
+
+def motion_at(trajectory: Trajectory, times_s: np.ndarray, *, intrinsics: Intrinsics, road: RoadView) -> EgoMotion:
+    """A run's ego-motion from a whole drive's trajectory.
+
+    Frames in a gap of more than a quarter second, or before or after the file, have the mode ``missing`` and confidence
+    0; their poses are carried over.
+
+    Args:
+        trajectory: of ``read_drive``.
+        times_s: (T,) times of the run's frames on the same clock, increasing.
+        intrinsics: of the run's pictures, kept with the result.
+        road: kept with the result.
     """
     times = np.asarray(times_s, dtype=np.float64)
-    if format == "tum":
-        trajectory = _resampled(read_tum(path), times, path)
-    elif format == "kitti":
-        trajectory = _per_frame(read_kitti(path, fps=fps), times, path, fps)
-    else:
-        raise TrajectoryError(f"trajectory format {format!r} is not known; give tum or kitti")
-    count = len(times)
+    seen = covered(trajectory.timestamps_s, times)
+    motion = resample(_held_to(trajectory, times[0], times[-1]), times)
+    mode = np.where(seen, motion_modes(motion), MISSING).astype("<U8")
     return EgoMotion(
-        trajectory=trajectory, mode=motion_modes(trajectory), confidence=np.ones(count, np.float32),
-        scale_source=np.full(count, "given", "<U8"), scale_sigma=np.zeros(count, np.float32),
-        intrinsics=intrinsics or prior_intrinsics(1056, 704),
-        road=RoadView(height_m=camera_height_m, pitch_rad=0.0, pitch_sigma_rad=float("inf")),
+        trajectory=motion, mode=mode, confidence=seen.astype(np.float32),
+        scale_source=np.where(seen, "given", "held").astype("<U8"),
+        scale_sigma=np.where(seen, 0.0, 1.0).astype(np.float32), intrinsics=intrinsics, road=road,
     )  # fmt: skip
+
+
+def covered(given_s: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """(T,) bool: times that lie between two rows not too far apart, or within half a usual step of either end."""
+    after = np.searchsorted(given_s, times_s).clip(1, max(len(given_s) - 1, 1))
+    gap = given_s[np.minimum(after, len(given_s) - 1)] - given_s[after - 1]
+    slack = min(_LONGEST_GAP_S, float(np.median(np.diff(given_s)))) / 2 if len(given_s) > 1 else 0.0
+    inside = (times_s >= given_s[0] - slack - 1e-6) & (times_s <= given_s[-1] + slack + 1e-6)
+    on_a_row = np.abs(times_s[:, None] - given_s[np.stack([after - 1, np.minimum(after, len(given_s) - 1)], 1)]) < 1e-6
+    return inside & ((gap <= _LONGEST_GAP_S + 1e-6) | on_a_row.any(axis=1))
 
 
 def motion_modes(trajectory: Trajectory) -> np.ndarray:
@@ -69,26 +152,6 @@ def motion_modes(trajectory: Trajectory) -> np.ndarray:
     return np.concatenate([mode[:1], mode])
 
 
-def _resampled(trajectory: Trajectory, times: np.ndarray, path: Path) -> Trajectory:
-    given = trajectory.timestamps_s
-    inside = (given[:-1] < times[-1]) & (given[1:] > times[0])
-    gaps = np.where(inside, np.diff(given), 0.0)
-    if len(gaps) and gaps.max() > _LONGEST_GAP_S:
-        at = int(gaps.argmax())
-        raise TrajectoryError(
-            f"{path}: {gaps[at]:.2f} s without a row after {given[at]:g} s; fill gaps of over {_LONGEST_GAP_S} s, or "
-            "leave that part of the video out"
-        )
-    # A file may begin or end between two of its own rows' times and the frames': half a gap is forgiven.
-    slack = min(_LONGEST_GAP_S, float(np.median(np.diff(given))) if len(given) > 1 else 0.0)
-    if times[0] < given[0] - slack or times[-1] > given[-1] + slack:
-        raise TrajectoryError(
-            f"{path}: covers {given[0]:g} to {given[-1]:g} s, the run needs {times[0]:g} to {times[-1]:g} s; give the "
-            "whole drive on the video's clock"
-        )
-    return resample(_held_to(trajectory, times[0], times[-1]), times)
-
-
 def _held_to(trajectory: Trajectory, first_s: float, last_s: float) -> Trajectory:
     """The trajectory with its ends held until the given times."""
     times, poses = trajectory.timestamps_s, trajectory.cam_to_world
@@ -96,13 +159,4 @@ def _held_to(trajectory: Trajectory, first_s: float, last_s: float) -> Trajector
         times, poses = np.concatenate([[first_s], times]), np.concatenate([poses[:1], poses])
     if last_s > times[-1]:
         times, poses = np.concatenate([times, [last_s]]), np.concatenate([poses, poses[-1:]])
-    return Trajectory(timestamps_s=times, cam_to_world=poses)
-
-
-def _per_frame(trajectory: Trajectory, times: np.ndarray, path: Path, fps: float) -> Trajectory:
-    if len(trajectory) != len(times):
-        raise TrajectoryError(
-            f"{path}: {len(trajectory)} rows ({len(trajectory) / fps:.2f} s) for {len(times)} frames; give one row for "
-            "each frame of the run, or a TUM file with times"
-        )
-    return Trajectory(timestamps_s=times, cam_to_world=trajectory.cam_to_world)
+    return rebased_trajectory(times, poses)

@@ -183,10 +183,38 @@ def select(
     raise typer.Exit(run_select(out, extend=extend, refreeze=refreeze, workers=workers))
 
 
+@app.command(rich_help_panel=STAGES)
+def ego(
+    job: Annotated[Path | None, typer.Argument(help="The job's folder (or --out).")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="The job's folder.")] = None,
+    imported: Annotated[
+        Path | None,
+        typer.Option(
+            "--import", help="Trajectories from elsewhere: a TUM or KITTI file, or a folder of <video_id>.tum."
+        ),
+    ] = None,
+    offset: Annotated[float, typer.Option(help="The file's time, seconds, at the video's first frame.")] = 0.0,
+    fps: Annotated[
+        float | None, typer.Option(min=0.1, help="Rows a second of a KITTI file; by default a row for each frame.")
+    ] = None,
+    workers: Workers = None,
+    part: PartOf = None,
+) -> None:
+    """The camera's trajectory over every run: corners, one camera per video, motion; or from a file."""
+    from labeling.ego_import import FileClock
+    from labeling.errors import ConfigError
+    from pipelines.commands import run_ego
+
+    folder = job or out
+    if folder is None:
+        raise ConfigError("no job is named; give its folder, as `animatic ego JOB`")
+    clock = FileClock(offset_s=offset, fps=fps)
+    raise typer.Exit(run_ego(folder, imported=imported, clock=clock, workers=workers, part=part))
+
+
 for _name, _text in (
     ("cut", "The 24 fps runs around kept clips; each frame decoded and encoded once."),
     ("keypoints", "Keypoints and tracks of every run."),
-    ("ego", "The camera's trajectory over every run."),
     ("render", "Skeleton, ego and object videos, and captions."),
     ("pack", "Shards and their index."),
 ):

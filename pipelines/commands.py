@@ -9,11 +9,13 @@ from typing import Any
 
 from dataset.receipts import Receipt, storage_errors
 from dataset.selection import read_selection
+from labeling.ego_import import FileClock
 from labeling.errors import ConfigError
 from labeling.extractors import Extractors
 from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, with_effort
 from pipelines.console import ConsoleReporter, print_failures
 from pipelines.engine import Engine
+from pipelines.imports import import_trajectories
 from pipelines.job import Job, find_videos, open_job, open_or_create
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
 from pipelines.layout import SELECTION
@@ -74,6 +76,28 @@ def run_single(stage: str, out: Path, *, workers: int | None = None, part: str |
     options = JobOptions(workers=workers, part=part)
     job = open_job(out)
     return _finish(job, run_job(job, COMMAND_STAGES[stage], options, reporter), reporter)
+
+
+def run_ego(
+    out: Path, *, imported: Path | None = None, clock: FileClock | None = None, workers: int | None = None,
+    part: str | None = None,
+) -> int:  # fmt: skip
+    """The ego stage of a job that is there, after taking trajectories from elsewhere where there are some; 0, or 1
+    where something failed."""
+    if imported is None:
+        return run_single("ego", out, workers=workers, part=part)
+    reporter = ConsoleReporter()
+    job = open_job(out)
+    taken = import_trajectories(job, imported, clock=clock)
+    others = len(job.sources) - len(taken)
+    reporter.console.print(
+        f"[bold]{'import':>10}[/] trajectories of {len(taken)} video{'s' * (len(taken) != 1)} ({', '.join(taken[:3])}"
+        f"{', ...' * (len(taken) > 3)}); {others} of the job's others stay as they are"
+    )
+    options = JobOptions(workers=workers, part=part)
+    code = _finish(job, run_job(job, COMMAND_STAGES["ego"], options, reporter), reporter)
+    reporter.console.print(f"{'':>10} `animatic label --out {out}` draws and packs what has changed")
+    return code
 
 
 def run_select(out: Path, *, extend: bool = False, refreeze: bool = False, workers: int | None = None) -> int:

@@ -3,7 +3,7 @@
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,19 @@ _LIST_SUFFIXES = frozenset({".txt", ".lst", ".list", ".tsv"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ImportedTrajectory:
+    """A video's trajectory from elsewhere, as copied into the job."""
+
+    file: str
+    """Relative to the job's folder."""
+    sha256: str
+    offset_s: float = 0.0
+    """The file's time at the video's first frame."""
+    fps: float | None = None
+    """Rows a second, of a file without times; None: a row for each frame of the source."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
     """One source video of a job."""
 
@@ -27,6 +40,8 @@ class Source:
     path: Path
     leave_out_s: tuple[float, float] = (0.0, 0.0)
     """Seconds at its start and at its end that no clip may touch (intro, credits)."""
+    trajectory: ImportedTrajectory | None = None
+    """Instead of an estimated one."""
 
 
 class Job:
@@ -116,6 +131,7 @@ def open_job(root: Path) -> Job:
             video_id=name,
             path=Path(entry["path"]),
             leave_out_s=_pair(entry.get("leave_out_s", (0, 0))),
+            trajectory=ImportedTrajectory(**entry["trajectory"]) if "trajectory" in entry else None,
         )
         for name, entry in (values.get("videos") or {}).items()
     }
@@ -139,7 +155,7 @@ def open_or_create(
         old = sources.get(source.video_id)
         if old is not None and old.path != source.path and old.path.exists():
             raise ConfigError(_same_id(source.video_id, old.path, source.path))
-        sources[source.video_id] = source
+        sources[source.video_id] = replace(source, trajectory=old.trajectory if old else None)
     if not sources:
         raise ConfigError(f"{root}: holds no job and no videos were given; name some VIDEO files or folders")
     models_dir = models_dir.absolute() if models_dir else (known.models_dir if known else None)
@@ -254,4 +270,6 @@ def _source_values(source: Source) -> dict[str, Any]:
     values: dict[str, Any] = {"path": str(source.path)}
     if any(source.leave_out_s):
         values["leave_out_s"] = list(source.leave_out_s)
+    if source.trajectory is not None:
+        values["trajectory"] = {name: value for name, value in asdict(source.trajectory).items() if value is not None}
     return values

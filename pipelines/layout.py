@@ -25,6 +25,11 @@ def camera_path(video_id: str) -> str:
     return f"videos/{video_id}/camera.json"
 
 
+def trajectory_path(video_id: str) -> str:
+    """A video's imported trajectory."""
+    return f"trajectories/{video_id}.txt"
+
+
 def run_item(video_id: str, run: Span) -> str:
     """A run's item name."""
     return f"{video_id}/{run_name(run)}"

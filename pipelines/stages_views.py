@@ -11,6 +11,7 @@ from dataset.selection import ClipRow
 from dataset.tables import EgoTable, read_ego, read_frames_table, read_keypoints
 from labeling.camera import Trajectory
 from labeling.captions import read_caption_table, template_caption
+from labeling.ego_import import MISSING
 from labeling.ego_video import ego_frames
 from labeling.encoding import EncoderSettings, VideoWriter
 from labeling.errors import DataError
@@ -104,16 +105,17 @@ class RenderStage:
         """Write the clip's views.
 
         Raises:
-            DroppedError: the clip touches a hole or holds a hard cut.
+            DroppedError: the clip touches a hole, holds a hard cut, or goes where an imported trajectory does not.
         """
         video_id, run = parse_run_item(item.payload["run"])
         start, end = item.inputs["clip"]
         clip = Span(start=start, end=end)
         fault = clip_fault(read_frames_table(root / run_path(video_id, run, ".frames.parquet")), clip)
+        ego = read_ego(root / run_path(video_id, run, ".ego.parquet"))
+        fault = fault or trajectory_fault(ego, clip)
         if fault is not None:
             raise DroppedError(fault)
         labels = clip_labels(root, video_id, run, clip)
-        ego = read_ego(root / run_path(video_id, run, ".ego.parquet"))
         trajectory = clip_trajectory(ego, clip)
         if item.settings["videos"] == "all":
             _draw_views(item, staging, clip, labels, ego, trajectory)
@@ -180,6 +182,15 @@ def clip_labels(root: Path, video_id: str, run: Span, clip: Span) -> list[Keypoi
     """A run's labels inside a clip; frames stay those of the video's grid."""
     path = root / run_path(video_id, run, ".keypoints.parquet")
     return read_keypoints(path, start=clip.start, end=clip.end)
+
+
+def trajectory_fault(ego: EgoTable, clip: Span) -> str | None:
+    """Why a clip has no trajectory: an imported file says nothing about some of its frames; None where it has one."""
+    first = clip.start - int(ego.frame[0])
+    gone = [index for index, mode in enumerate(ego.mode[first : first + len(clip)]) if mode == MISSING]
+    if not gone:
+        return None
+    return f"no_trajectory={len(gone)} of {len(clip)} frames from {(clip.start + gone[0]) / FPS:.3f} s"
 
 
 def clip_trajectory(ego: EgoTable, clip: Span) -> Trajectory:

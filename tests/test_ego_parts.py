@@ -1,20 +1,17 @@
-"""The parts of ego-motion one by one: modes, speeds, smoothing, the road, calibration, imported trajectories."""
-
-from pathlib import Path
+"""The parts of ego-motion one by one: modes, speeds, smoothing, the road, calibration."""
 
 import numpy as np
 import pytest
 from ego_fixtures import HEIGHT, WIDTH, driven, tracks_of
 
-from labeling.camera import Intrinsics, Trajectory, write_kitti, write_tum
+from labeling.camera import Intrinsics
 from labeling.ego_calibration import calibrate_camera, find_turns, focal_from_turns, pooled_road
-from labeling.ego_import import import_trajectory, motion_modes
 from labeling.ego_modes import cheapest_path, travel_signs
 from labeling.ego_motion import RoadView
 from labeling.ego_scale import Depths, pooled_pitch, step_in_heights
 from labeling.ego_smoothing import smoothed
 from labeling.ego_speed import LengthEvidence, run_speeds
-from labeling.errors import DataError, TrajectoryError
+from labeling.errors import DataError
 
 
 def test_a_doubtful_step_does_not_switch_the_mode():
@@ -155,64 +152,3 @@ def test_runs_that_disagree_widen_the_pitch():
 
     assert pooled_road([view(0.01), view(0.01)], 1.5).pitch_sigma_rad < 0.001
     assert pooled_road([view(-0.02), view(0.02)], 1.5).pitch_sigma_rad > 0.01
-
-
-@pytest.fixture
-def drive() -> Trajectory:
-    poses = driven(np.full(48, 6.0), 10.0)
-    return Trajectory(timestamps_s=np.arange(48) / 24, cam_to_world=poses)
-
-
-def test_a_tum_file_comes_back_at_the_frames_times(tmp_path, drive):
-    write_tum(drive, tmp_path / "drive.tum")
-    times = 0.5 + np.arange(24) / 24
-    motion = import_trajectory(tmp_path / "drive.tum", "tum", times)
-    assert np.allclose(motion.trajectory.cam_to_world, drive.slice(12, 36).cam_to_world, atol=1e-6)
-    assert (motion.mode == "moving").all() and (motion.scale_source == "given").all()
-
-
-def test_a_kitti_file_needs_a_row_for_each_frame(tmp_path, drive):
-    write_kitti(drive, tmp_path / "drive.txt")
-    motion = import_trajectory(tmp_path / "drive.txt", "kitti", drive.timestamps_s)
-    assert np.allclose(motion.trajectory.cam_to_world, drive.cam_to_world, atol=1e-6)
-    with pytest.raises(TrajectoryError, match="48 rows .* for 47 frames"):
-        import_trajectory(tmp_path / "drive.txt", "kitti", drive.timestamps_s[:-1])
-
-
-def rows_of(drive: Trajectory, path: Path) -> np.ndarray:
-    write_tum(drive, path)
-    return np.loadtxt(path)
-
-
-@pytest.mark.parametrize(
-    ("harm", "message"),
-    [
-        (lambda rows: rows[::-1], "does not increase"),
-        (lambda rows: np.delete(rows, np.arange(15, 30), axis=0), "without a row after"),
-        (lambda rows: rows[:20], "covers .* the run needs"),
-        (lambda rows: rows * np.array([1, 1, 1, 1, 2, 2, 2, 2]), "quaternion of length"),
-        (lambda rows: rows[:, :7], "rows of 8 numbers"),
-    ],
-    ids=["backwards", "gap", "short", "no rotation", "columns"],
-)
-def test_a_tum_file_that_cannot_be_is_refused(tmp_path, drive, harm, message):
-    path = tmp_path / "drive.tum"
-    np.savetxt(path, harm(rows_of(drive, path)))
-    with pytest.raises(TrajectoryError, match=message):
-        import_trajectory(path, "tum", drive.timestamps_s)
-
-
-def test_a_kitti_file_without_rotations_is_refused(tmp_path, drive):
-    write_kitti(drive, tmp_path / "drive.txt")
-    rows = np.loadtxt(tmp_path / "drive.txt")
-    rows[5, 0] = 2.0
-    np.savetxt(tmp_path / "drive.txt", rows)
-    with pytest.raises(TrajectoryError, match="not a rigid motion"):
-        import_trajectory(tmp_path / "drive.txt", "kitti", drive.timestamps_s)
-
-
-def test_modes_of_an_imported_drive():
-    speeds = np.concatenate([np.zeros(10), np.zeros(10), np.full(10, 5.0)])
-    rates = np.concatenate([np.zeros(10), np.full(10, 20.0), np.zeros(10)])
-    mode = motion_modes(Trajectory(timestamps_s=np.arange(30) / 24, cam_to_world=driven(speeds, rates)))
-    assert list(dict.fromkeys(mode)) == ["still", "turning", "moving"]
