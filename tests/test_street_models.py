@@ -20,7 +20,7 @@ from training.street_augment import AugmentSettings, disturb, map_points, random
 from training.street_batches import Batch, CropBatches, FieldBatches, mirror_order
 from training.street_export import export_model, fold_norms
 from training.street_fitting import FitSettings, fit, rate_at
-from training.street_losses import detector_loss, field_loss
+from training.street_losses import detector_loss, field_loss, simcc_loss
 from training.street_models import evaluate
 from training.street_networks import FieldGraph, FieldNetwork, SimccGraph, SimccNetwork, StreetDetector
 from training.street_plans import plan_streets
@@ -184,6 +184,40 @@ def test_a_short_training_lowers_the_loss_and_repeats_with_its_seed(toy_pool: St
     assert probe_loss(networks[0]) < 0.95 * before
     for one, other in zip(networks[0].state_dict().values(), networks[1].state_dict().values(), strict=True):
         assert torch.equal(one, other)
+
+
+def test_a_training_that_stopped_goes_on_to_the_same_weights(toy_pool: StreetPool, tmp_path: Path) -> None:
+    batches = FieldBatches(pool=toy_pool, schemas=("lane24",), size=(257, 193), count=1, augment=AugmentSettings())
+    settings = FitSettings(seed=3, steps=6, report_every=2)
+
+    def stopping(rng: np.random.Generator) -> Batch:
+        if rng.bit_generator.state == np.random.default_rng((3, 4)).bit_generator.state:
+            raise KeyboardInterrupt
+        return batches(rng)
+
+    def train(make_batch, checkpoint: Path | None) -> torch.nn.Module:
+        torch.manual_seed(3)
+        network = FieldNetwork(("lane24",), widths=(8, 8, 8, 8), width=8)
+        return fit(network, make_batch, field_batch_loss, settings, checkpoint=checkpoint)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(stopping, tmp_path / "state.pt")
+    assert (tmp_path / "state.pt").is_file()
+    resumed, whole = train(batches, tmp_path / "state.pt"), train(batches, None)
+    for one, other in zip(resumed.state_dict().values(), whole.state_dict().values(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_points_in_doubt_score_lower_when_hidden_ones_weigh_more() -> None:
+    flat = torch.zeros(1, 2, 8)
+    for weight in (1.0, 3.0):
+        seen = torch.zeros(1, 2, requires_grad=True)
+        loss = simcc_loss(
+            (flat, flat, seen), (flat, flat), torch.ones(1, 2), torch.tensor([[1.0, 0.0]]), torch.ones(1),
+            hidden_weight=weight,
+        )  # fmt: skip
+        (slope,) = torch.autograd.grad(loss, seen)
+        assert float(-slope[0, 1] / slope[0, 0]) == pytest.approx(weight)
 
 
 def test_the_detector_loss_is_least_for_the_truth() -> None:

@@ -23,7 +23,7 @@ from labeling.model_cards import write_card as write_model_card
 from training.street_export import export_model
 from training.street_field_scores import judge_car_fields
 from training.street_fitting import fit
-from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, judging_frames, plan_streets
+from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, judging_frames, plan_streets
 from training.street_pool import StreetPool, render_pool
 from training.street_recipes import MODEL_NAMES, ModelName, Recipe, recipe
 from training.street_scores import StreetModels, Tally, judge_frame
@@ -31,6 +31,8 @@ from training.street_thresholds import choose_thresholds
 
 WORKERS = 2
 """Processes that render and train."""
+JUDGED_FRAMES = 6
+"""Of each street that chooses thresholds or judges."""
 CAR_FIELDS: ModelName = "street_car24_fields"
 """Cars bottom-up: an alternative to detector and head, judged beside them."""
 
@@ -74,13 +76,13 @@ def _train_job(job: _Job) -> tuple[str, float]:
     return name, time.perf_counter() - start
 
 
-def evaluate(folder: Path, *, streets: int = 30, frames: int = 6, first_seed: int = HELD_OUT_SEED) -> dict[str, float]:
+def evaluate(folder: Path, *, streets: int = 30, frames: int = JUDGED_FRAMES) -> dict[str, float]:
     """Figures of the models in ``folder`` on held-out streets, through the labelling code."""
     models, cars, tally = open_models(folder), open_car_fields(folder), Tally()
-    for rgb, truths in judging_frames(first_seed, streets, frames):
+    for rgb, truths in judging_frames(HELD_OUT_SEED, streets, frames):
         judge_frame(models, rgb, truths, tally)
         if cars is not None:
-            judge_car_fields(cars, rgb, truths, tally)
+            judge_car_fields(cars.estimate([rgb])[0], truths, tally)
     return tally.figures()
 
 
@@ -106,7 +108,7 @@ def open_car_fields(folder: Path) -> FieldModel | None:
     return FieldModel(card, folder / card.file) if isinstance(card, CifcafCard) else None
 
 
-def write_figures(folder: Path, figures: dict[str, float], *, streets: int, frames: int) -> None:
+def write_figures(folder: Path, figures: dict[str, float], *, frames: int) -> None:
     """Put each model's figures into its card."""
     prefixes = {
         "street_detector": ("car_recall", "car_phantoms", "person_recall", "person_phantoms", "count"),
@@ -116,7 +118,7 @@ def write_figures(folder: Path, figures: dict[str, float], *, streets: int, fram
         CAR_FIELDS: ("fields_",),
     }
     notes = (
-        f"Figures: {streets * frames} frames of {streets} streets never trained on (seeds from {HELD_OUT_SEED}); "
+        f"Figures: {frames} frames of streets never trained on (seeds from {HELD_OUT_SEED}); "
         "objects at least 32 px high and 30 % visible; points in found boxes, a missed object's points are wrong; a "
         "count is exact where all of them are found and nothing else but lower or more hidden objects."
     )
@@ -128,7 +130,7 @@ def write_figures(folder: Path, figures: dict[str, float], *, streets: int, fram
 
 
 def train_all(options: argparse.Namespace) -> None:
-    """The pool, the models that ``--only`` names, and the detector's thresholds."""
+    """The pool, the models that ``--only`` names, and their thresholds."""
     start = time.perf_counter()
     pool = render_pool(
         plan_streets(TRAIN_SEED, options.streets, frames=9, every=12, crowded=True), workers=options.workers
@@ -141,9 +143,8 @@ def train_all(options: argparse.Namespace) -> None:
         options.only, pool, options.out, seed=options.seed, share=options.share, checkpoints=options.checkpoints,
         workers=options.workers,
     )  # fmt: skip
-    if "street_detector" in options.only:
-        card = choose_thresholds(options.out / "street_detector.toml", streets=options.judged_streets)
-        print(f"score thresholds {card.score_thresholds}", flush=True)
+    frames = list(judging_frames(VALIDATION_SEED, options.judged_streets, JUDGED_FRAMES))
+    choose_thresholds(options.out, options.only, frames)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -165,9 +166,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     start = time.perf_counter()
     if not options.evaluate:
         train_all(options)
-    frames = 6
-    figures = evaluate(options.out, streets=options.judged_streets, frames=frames)
-    write_figures(options.out, figures, streets=options.judged_streets, frames=frames)
+    figures = evaluate(options.out, streets=options.judged_streets)
+    write_figures(options.out, figures, frames=options.judged_streets * JUDGED_FRAMES)
     for key, value in figures.items():
         print(f"{key:32s} {value:.4f}")
     spent = {"wall_s": round(time.perf_counter() - start), "cpu_s": round(_cpu_seconds()), "workers": options.workers}

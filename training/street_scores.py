@@ -88,7 +88,7 @@ def judge_frame(models: StreetModels, rgb: np.ndarray, truths: tuple[ObjectTruth
     if models.fields is not None:
         lanes = tuple(truth for truth in truths if truth.category == "lane")
         found_lanes = [item.points for item in models.fields.estimate([rgb])[0] if item.category == "lane"]
-        _judge_lanes(found_lanes, lanes, tally)
+        judge_lanes(found_lanes, lanes, tally)
 
 
 def match_boxes(boxes_xyxy: np.ndarray, truths: Sequence[BoxTruth]) -> tuple[np.ndarray, np.ndarray]:
@@ -162,7 +162,8 @@ def _judge_points(
         tally.add(f"{category}_right_above_0.9", right[mine[:, 2] >= SURE_SCORE])
 
 
-def _judge_lanes(found: list[np.ndarray], truths: tuple[ObjectTruth, ...], tally: Tally) -> None:
+def judge_lanes(found: list[np.ndarray], truths: tuple[ObjectTruth, ...], tally: Tally) -> None:
+    """Add the outcomes of a frame's lanes, (24, 3) points each, to ``tally``."""
     wanted = [truth for truth in truths if is_judged(truth)]
     curves = [truth.points_xy for truth in truths]
     free, errors = set(range(len(curves))), []

@@ -1,45 +1,81 @@
-"""The detector's score thresholds, chosen on streets that neither train nor judge: as many exact counts as can be."""
+"""Thresholds of the street models, chosen on streets that neither train nor judge: as many exact counts as can be."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from labeling.detection import Detections, Detector
-from labeling.model_cards import YoloxCard, read_card, write_card
-from training.street_plans import VALIDATION_SEED, judging_frames
+from labeling.fields import FieldModel
+from labeling.labels import Keypoints
+from labeling.model_cards import CifcafCard, YoloxCard, read_card, write_card
+from training.street_field_scores import judge_car_fields
 from training.street_pool import ObjectTruth
-from training.street_scores import is_judged, match_boxes
+from training.street_scores import Tally, is_judged, judge_lanes, match_boxes
 
-_CANDIDATES = tuple(float(value) for value in np.round(np.arange(0.2, 0.76, 0.05), 2))
+BOX_SCORES = tuple(float(value) for value in np.round(np.arange(0.2, 0.76, 0.05), 2))
+"""Of boxes, to choose from."""
+OBJECT_SCORES = tuple(float(value) for value in np.round(np.arange(0.16, 0.45, 0.03), 2))
+"""Of bottom-up objects, to choose from."""
+JudgedFrame = tuple[np.ndarray, tuple[ObjectTruth, ...]]
+"""(H, W, 3) uint8 RGB, and what is true in it."""
 
 
-def choose_thresholds(card_path: Path, *, streets: int = 30, frames: int = 6) -> YoloxCard:
-    """Write the thresholds that give most frames exact counts of each class into a detector's card.
+def choose_thresholds(folder: Path, names: Sequence[str], frames: Sequence[JudgedFrame]) -> None:
+    """Write the thresholds that give most frames exact counts into the cards that have any.
 
     Args:
-        card_path: a street detector's card beside its weights.
-        streets: how many choose.
-        frames: of each.
-
-    Returns:
-        The card as written.
+        folder: of the cards and their weights.
+        names: of the cards.
+        frames: that choose.
     """
-    card = read_card(card_path)
-    assert isinstance(card, YoloxCard)
-    eager = card.model_copy(update={"score_threshold": _CANDIDATES[0], "score_thresholds": {}})
-    detector = Detector(eager, card_path.with_name(card.file))
+    for name in names:
+        card = read_card(folder / f"{name}.toml")
+        if isinstance(card, YoloxCard):
+            card = choose_box_scores(card, folder, frames)
+        elif isinstance(card, CifcafCard):
+            card = choose_object_score(card, folder, frames)
+        write_card(card, folder / f"{name}.toml")
+
+
+def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFrame]) -> YoloxCard:
+    """The card with the best threshold of each class; each is chosen by its own class's counts."""
+    eager = card.model_copy(update={"score_threshold": BOX_SCORES[0], "score_thresholds": {}})
+    detector = Detector(eager, folder / card.file)
     exact: dict[str, list[list[bool]]] = {name: [] for name in card.class_names}
-    for rgb, truths in judging_frames(VALIDATION_SEED, streets, frames):
+    for rgb, truths in frames:
         found = detector.detect([rgb])[0]
         for name, rows in exact.items():
             seen = found.select(found.classes == name)
             mine = [truth for truth in truths if truth.category == card.categories[name]]
-            rows.append([counts_exactly(seen, mine, threshold) for threshold in _CANDIDATES])
-    best = {name: best_threshold(np.array(rows).mean(axis=0)) for name, rows in exact.items()}
-    chosen = card.model_copy(update={"score_threshold": min(best.values()), "score_thresholds": best})
-    write_card(chosen, card_path)
-    return chosen
+            rows.append([counts_exactly(seen, mine, threshold) for threshold in BOX_SCORES])
+    best = {name: best_threshold(np.mean(rows, axis=0), BOX_SCORES) for name, rows in exact.items()}
+    return card.model_copy(update={"score_threshold": min(best.values()), "score_thresholds": best})
+
+
+def choose_object_score(card: CifcafCard, folder: Path, frames: Sequence[JudgedFrame]) -> CifcafCard:
+    """The card of one schema with the best threshold of its objects."""
+    (head,) = card.heads
+    eager = head.model_copy(update={"instance_threshold": OBJECT_SCORES[0]})
+    model = FieldModel(card.model_copy(update={"heads": (eager,)}), folder / card.file)
+    figure, judge = _FIELD_JUDGES[head.schema_name]
+    tallies = [Tally() for _ in OBJECT_SCORES]
+    for rgb, truths in frames:
+        found = model.estimate([rgb])[0]
+        for threshold, tally in zip(OBJECT_SCORES, tallies, strict=True):
+            judge([item for item in found if item.score >= threshold], truths, tally)
+    best = best_threshold(np.array([tally.figures()[figure] for tally in tallies]), OBJECT_SCORES)
+    return card.model_copy(update={"heads": (head.model_copy(update={"instance_threshold": best}),)})
+
+
+def _judge_lanes(found: Sequence[Keypoints], truths: tuple[ObjectTruth, ...], tally: Tally) -> None:
+    judge_lanes([item.points for item in found], tuple(one for one in truths if one.category == "lane"), tally)
+
+
+_FIELD_JUDGES: dict[str, tuple[str, Callable[[Sequence[Keypoints], tuple[ObjectTruth, ...], Tally], None]]] = {
+    "lane24": ("lane_count_exact", _judge_lanes),
+    "car24": ("fields_car_count_exact", judge_car_fields),
+}
 
 
 def counts_exactly(found: Detections, truths: Sequence[ObjectTruth], threshold: float) -> bool:
@@ -49,11 +85,12 @@ def counts_exactly(found: Detections, truths: Sequence[ObjectTruth], threshold: 
     return not missed and not len(phantoms)
 
 
-def best_threshold(shares: np.ndarray) -> float:
-    """Of ``_CANDIDATES`` the one around which the share of exact counts is highest: a lone peak is luck.
+def best_threshold(shares: np.ndarray, candidates: Sequence[float]) -> float:
+    """The candidate around which the share of exact counts is highest: a lone peak is luck.
 
     Args:
-        shares: (len(_CANDIDATES),) 0 to 1.
+        shares: (n,) 0 to 1, one per candidate.
+        candidates: n values, rising.
     """
     smooth = np.convolve(np.pad(shares, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid")
-    return _CANDIDATES[int(smooth.argmax())]
+    return candidates[int(smooth.argmax())]

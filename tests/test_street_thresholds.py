@@ -1,0 +1,91 @@
+"""The street models' thresholds, and how bottom-up cars are judged."""
+
+import numpy as np
+import pytest
+
+from labeling.detection import Detections
+from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
+from training.street_field_scores import judge_car_fields
+from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, plan_streets
+from training.street_pool import ObjectTruth
+from training.street_scores import Tally
+from training.street_thresholds import BOX_SCORES, best_threshold, counts_exactly
+
+
+def car(left: float, *, height: float = 60.0, share: float = 1.0) -> ObjectTruth:
+    """A car 100 px wide whose 24 points lie along its diagonal; every other one is hidden."""
+    box = np.array([left, 200, left + 100, 200 + height], np.float32)
+    along = np.linspace(0, 1, 24, dtype=np.float32)[:, None]
+    return ObjectTruth(
+        category="car", box_xyxy=box, points_xy=box[:2] + along * (box[2:] - box[:2]),
+        visible=np.arange(24) % 2 == 0, visible_share=share,
+    )  # fmt: skip
+
+
+def detections(truths: list[ObjectTruth], scores: list[float]) -> Detections:
+    names = np.array(["car"] * len(scores))
+    return Detections(
+        boxes_xyxy=np.array([truth.box_xyxy for truth in truths]).reshape(-1, 4),
+        scores=np.array(scores, np.float32), classes=names, categories=names,
+    )  # fmt: skip
+
+
+def bottom_up(truth: ObjectTruth, *, off_px: float = 0.0) -> Keypoints:
+    """The truth's visible points, moved right, as a bottom-up network gives them."""
+    shown = truth.visible[:, None]
+    points = np.concatenate([truth.points_xy + (off_px, 0), np.full((24, 1), 0.95)], axis=1) * shown
+    seen = points[truth.visible, :2]
+    return Keypoints(
+        frame=0, category="car", schema="car24", score=0.6, points=points.astype(np.float32),
+        box_xyxy=np.concatenate([seen.min(axis=0), seen.max(axis=0)]).astype(np.float32),
+        point_source=np.where(truth.visible, POINT_DETECTED, POINT_ABSENT).astype(np.int8),
+    )  # fmt: skip
+
+
+def test_counts_are_exact_where_all_judged_objects_and_nothing_else_is_found() -> None:
+    truths = [car(0), car(200), car(400, height=20), car(600, share=0.2)]
+    found = detections([*truths, car(800)], [0.9, 0.5, 0.5, 0.5, 0.4])
+    assert counts_exactly(found, truths, 0.45), "objects that are not judged may be found"
+    assert not counts_exactly(found, truths, 0.6), "one is missed"
+    assert not counts_exactly(found, truths, 0.3), "one is not there"
+
+
+def test_the_middle_of_a_plateau_beats_a_lone_peak() -> None:
+    shares = np.full(len(BOX_SCORES), 0.2)
+    shares[1] = 0.9
+    shares[6:9] = 0.85
+    assert best_threshold(shares, BOX_SCORES) == BOX_SCORES[7]
+
+
+def test_bottom_up_cars_are_judged_point_by_point() -> None:
+    truths = (car(0), car(300))
+    tally = Tally()
+    judge_car_fields([bottom_up(truths[0], off_px=5), bottom_up(truths[1], off_px=20)], truths, tally)
+    figures = tally.figures()
+    assert figures["fields_car_recall"] == figures["fields_car_count_exact"] == 1
+    assert figures["fields_car_pck10"] == 0.5, "5 px are within a tenth of the diagonal, 20 px are not"
+    assert figures["fields_car_right_above_0.9"] == 0.5
+    assert figures["fields_car_hidden_below_0.3"] == 1
+
+
+def test_missed_bottom_up_cars_and_phantoms_count_against_the_model() -> None:
+    tally = Tally()
+    judge_car_fields([bottom_up(car(600))], (car(0),), tally)
+    figures = tally.figures()
+    assert figures["fields_car_pck10"] == figures["fields_car_recall"] == figures["fields_car_count_exact"] == 0
+    assert figures["fields_car_phantoms_per_frame"] == 1
+
+
+def test_no_street_both_trains_chooses_and_judges() -> None:
+    seeds = [
+        {plan.config.seed for plan in plan_streets(first, count)}
+        for first, count in ((TRAIN_SEED, 240), (VALIDATION_SEED, 30), (HELD_OUT_SEED, 30))
+    ]
+    assert len(set.union(*seeds)) == sum(map(len, seeds))
+
+
+@pytest.mark.parametrize("crowded", [False, True])
+def test_only_learners_see_crowds(crowded: bool) -> None:
+    walkers = [plan.config.walkers_per_100_m for plan in plan_streets(7, 40, crowded=crowded)]
+    assert (max((value or 0) for value in walkers) == 30) == crowded
+    assert None in walkers
