@@ -65,6 +65,9 @@ class Detections:
 class Detector:
     """A YOLOX network behind its card.
 
+    Attributes:
+        left_out: objects beyond the card's ``max_detections``, over all frames so far.
+
     Raises:
         ModelError: as ``OnnxModel``.
     """
@@ -80,6 +83,7 @@ class Detector:
     ) -> None:
         self.card = card
         self.model = OnnxModel(card, path, providers=providers, threads=threads, max_batch=max_batch)
+        self.left_out = 0
 
     def detect(self, frames: Sequence[np.ndarray]) -> list[Detections]:
         """Detections of each frame, (H, W, 3) uint8 RGB; sizes may differ.
@@ -94,6 +98,7 @@ class Detector:
         found = []
         for output, frame, (_, ratio) in zip(outputs, frames, pictures, strict=True):
             found.append(decode_yolox(output, self.card, ratio=ratio, width=frame.shape[1], height=frame.shape[0]))
+            self.left_out += found[-1].left_out
         return found
 
 

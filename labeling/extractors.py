@@ -114,6 +114,12 @@ class Extractors:
             self.heads["person"] = PersonHead(full, small=small) if full else people[0]
         self.fields = [FieldModel(card, _path(card, models_dir), **options) for card in choice.fields]
 
+    @property
+    def left_out(self) -> dict[str, int]:
+        """By card: what was seen beyond the card's most in a frame and not looked at, over all frames so far."""
+        models = (*((self.detector,) if self.detector else ()), *self.fields)
+        return {model.card.name: model.left_out for model in models}
+
 
 def _wanted(names: Sequence[str] | None, cards: Mapping[str, AnyCard]) -> list[AnyCard]:
     if names is None:

@@ -329,7 +329,7 @@ def _occupied(objects: np.ndarray, count: int, kind: int, x: float, y: float) ->
 def grow_all(
     seeds: np.ndarray, seed_scores: np.ndarray, cells: Cells, links: Connections, index: MapIndex, graph: Graph,
     threshold: float, relative: float, max_objects: int,
-) -> np.ndarray:  # fmt: skip
+) -> tuple[np.ndarray, int]:  # fmt: skip
     """One object from every seed that no earlier object covers.
 
     Args:
@@ -344,24 +344,25 @@ def grow_all(
         max_objects: it stops there.
 
     Returns:
-        (M, K, 4) float64: x, y, scale, score.
+        (M, K, 4) float64: x, y, scale, score; and how many seeds were left that no object covers.
     """
     objects = np.zeros((max_objects, len(graph.starts) - 1, 4), np.float64)
-    count = 0
+    count, left_out = 0, 0
     for rank in range(len(seeds)):
-        if count == max_objects:
-            break
         cell = seeds[rank]
         kind = int(cells.kind[cell])
         x, y = cells.values[cell, _X], cells.values[cell, _Y]
         if _occupied(objects, count, kind, x, y):
+            continue
+        if count == max_objects:
+            left_out += 1
             continue
         points = objects[count]
         points[kind, 0], points[kind, 1], points[kind, 2] = x, y, cells.values[cell, _SCALE]
         points[kind, 3] = seed_scores[cell]
         grow(points, kind, links, index, graph, threshold, relative)
         count += 1
-    return objects[:count].copy()
+    return objects[:count].copy(), left_out
 
 
 @njit(cache=True)

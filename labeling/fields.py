@@ -25,10 +25,14 @@ class FieldDecoder:
     Args:
         head: schema and thresholds.
         stride: pixels per cell.
+
+    Attributes:
+        left_out: seeds of objects beyond the card's ``max_objects``, over all frames so far.
     """
 
     def __init__(self, head: FieldHeadCard, *, stride: int) -> None:
         self.head, self.stride = head, stride
+        self.left_out = 0
         table = keypoint_schema(head.schema_name)
         self.edges = np.array(table.edges)
         self.graph = _graph(self.edges, table.point_count)
@@ -64,10 +68,12 @@ class FieldDecoder:
         seeds = np.flatnonzero(seed_scores >= head.seed_threshold)
         seeds = seeds[np.argsort(-seed_scores[seeds], kind="stable")]
         links = growth.gather_connections(caf, head.connection_threshold, stride, width)
-        return growth.grow_all(
+        objects, left_out = growth.grow_all(
             seeds, seed_scores, cells, links, index, self.graph,
             head.growth_threshold, head.relative_threshold, head.max_objects,
         )  # fmt: skip
+        self.left_out += int(left_out)
+        return objects
 
 
 class FieldModel:
@@ -89,6 +95,11 @@ class FieldModel:
         self.card = card
         self.model = OnnxModel(card, path, providers=providers, threads=threads, max_batch=max_batch)
         self.decoders = tuple(FieldDecoder(head, stride=card.stride) for head in card.heads)
+
+    @property
+    def left_out(self) -> int:
+        """Seeds of objects beyond what the card allows in a frame, over all frames so far."""
+        return sum(decoder.left_out for decoder in self.decoders)
 
     @property
     def schema_names(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 
 from rich.console import Console
@@ -60,6 +61,7 @@ class ConsoleReporter:
         words += [f"{count} dropped ({reason})" for reason, count in dropped.items()]
         words += [f"[red]{len(report.failed)} failed[/]"] if report.failed else []
         words += [f"{report.current} up to date"] if report.current else []
+        words += left_out_words(report.made)
         self.console.print(f"[bold]{report.stage:>10}[/] {', '.join(words)} [dim]({duration(report.seconds)})[/]")
 
     def waiting(self, message: str) -> None:
@@ -68,6 +70,14 @@ class ConsoleReporter:
         if text != message or time.monotonic() - at > 60:
             self.console.print(f"[yellow]waiting[/] {escape(message)}")
             self._notice = (message, time.monotonic())
+
+
+def left_out_words(receipts: Sequence[Receipt]) -> list[str]:
+    """What networks saw beyond their cards' most in a frame, as one remark for each card."""
+    total: Counter[str] = Counter()
+    for receipt in receipts:
+        total.update(receipt.facts.get("left_out", {}))
+    return [f"[yellow]{card} saw {count} more than its card allows in a frame[/]" for card, count in total.items()]
 
 
 def print_error(error: Exception) -> None:

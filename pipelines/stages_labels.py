@@ -56,18 +56,23 @@ class KeypointsStage:
         video_id, run = parse_run_item(item.name)
         frames = read_frames_table(root / run_path(video_id, run, ".frames.parquet"))
         labels: list[Keypoints] = []
+        left_out: dict[str, int] = {}
         if item.settings["cards"]:
+            extractors = self._open(item)
+            before = extractors.left_out
             labels = label_frames(
                 read_frames(root / run_path(video_id, run, ".mp4")), first_frame=run.start,
-                extractors=self._open(item), effort=item.settings["keypoints"]["effort"], breaks=run_breaks(frames),
+                extractors=extractors, effort=item.settings["keypoints"]["effort"], breaks=run_breaks(frames),
             )  # fmt: skip
+            left_out = {name: count - before[name] for name, count in extractors.left_out.items()}
         outside = [label.frame for label in labels if not run.start <= label.frame < run.end]
         if outside:
             raise DataError(f"{item.name}: has labels of frame {outside[0]}, which is not its own; please report it")
         target = staging / Path(item.outputs[0]).name
         write_keypoints(target, labels, metadata={"models": item.models})
         tracks = {(label.category, label.track_id) for label in labels}
-        return {"frames": len(run), "labels": len(labels), "tracks": len(tracks)}
+        crowd = {name: count for name, count in left_out.items() if count}
+        return {"frames": len(run), "labels": len(labels), "tracks": len(tracks), "left_out": crowd}
 
     def _open(self, item: WorkItem) -> Extractors:
         """The networks, opened once in each process."""

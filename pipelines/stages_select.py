@@ -101,14 +101,18 @@ class CountStage:
         )  # fmt: skip
         detector = self._open(item)
         picture = picture_map(index, PictureSettings.model_validate(item.settings["picture"]))
-        rows = []
+        rows, before = [], detector.left_out
         for frame in decode_at(Path(item.payload["path"]), list(looks), picture=picture):
             found = detector.detect([frame.rgb])[0].distinct()
             rows.append({"time_s": frame.time_s, "classes": found.classes.tolist(), "scores": found.scores.tolist()})
         if len(looks) and not rows:
             raise VideoError(f"{item.payload['path']}: none of {len(looks)} frames decodes; get the file again")
         write_table(staging / "counts.parquet", table_of(COUNTS_SCHEMA, rows))
-        return {"looks": len(rows), "clips": len(plan.kept), "objects": sum(len(row["classes"]) for row in rows)}
+        crowd = detector.left_out - before
+        return {
+            "looks": len(rows), "clips": len(plan.kept), "objects": sum(len(row["classes"]) for row in rows),
+            "left_out": {detector.card.name: crowd} if crowd else {},
+        }  # fmt: skip
 
     def _open(self, item: WorkItem) -> Detector:
         """The detector, opened once in each process."""

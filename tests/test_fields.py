@@ -150,7 +150,15 @@ def test_empty_fields_hold_nothing() -> None:
 def test_a_frame_of_noise_ends_at_the_cap() -> None:
     cif, caf = random_fields(0, schema="car24", height=45, width=67, share=0.9)
     head = FieldHeadCard(schema="car24", max_objects=30, seed_threshold=0.05, instance_threshold=0.0)
-    assert 0 < len(FieldDecoder(head, stride=8).decode(cif, caf)) <= 30
+    decoder = FieldDecoder(head, stride=8)
+    assert 0 < len(decoder.decode(cif, caf)) <= 30
+    first = decoder.left_out
+    assert first > 0, "and it is said"
+    decoder.decode(cif, caf)
+    assert decoder.left_out == 2 * first
+    roomy = FieldDecoder(head.model_copy(update={"max_objects": 5000}), stride=8)
+    roomy.decode(cif, caf)
+    assert roomy.left_out == 0
 
 
 def test_object_scores_count_the_best_three_thrice() -> None:
