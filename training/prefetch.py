@@ -4,6 +4,7 @@ import contextlib
 import queue
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -42,24 +43,24 @@ class Prefetched:
 
     def __exit__(self, *_: object) -> None:
         self._closed.set()
-        self._thread.join(_LEAVE_S)
+        until = time.monotonic() + _LEAVE_S
+        while self._thread.is_alive() and time.monotonic() < until:
+            # It may be waiting for room.
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    self._ready.get_nowait()
+            self._thread.join(_LOOK_S)
 
     def _fetch(self) -> None:
         try:
             for batch in self._batches:
-                if not self._put("batch", batch, self._loader.state_dict()):
+                self._ready.put(("batch", batch, self._loader.state_dict()))
+                if self._closed.is_set():
                     return
-            self._put("end", None, {})
+            self._ready.put(("end", None, {}))
         except BaseException as error:
             # It belongs to whoever waits for the batch.
-            self._put("error", error, {})
-
-    def _put(self, kind: str, content: Any, state: dict[str, Any]) -> bool:
-        while not self._closed.is_set():
-            with contextlib.suppress(queue.Full):
-                self._ready.put((kind, content, state), timeout=_LOOK_S)
-                return True
-        return False
+            self._ready.put(("error", error, {}))
 
     def __iter__(self) -> Iterator[Any]:
         return self

@@ -45,7 +45,7 @@ class RunLog:
             TextColumn("[bold]{task.description}"), BarColumn(bar_width=20),
             TextColumn("{task.completed}/{task.total} loss {task.fields[loss]} {task.fields[rate]}"),
             TimeRemainingColumn(), TextColumn("{task.fields[memory]}"),
-            console=Console(stderr=True), disable=quiet or not self._main, refresh_per_second=2,
+            console=Console(stderr=True), disable=quiet or not self._main, refresh_per_second=1,
         )  # fmt: skip
         self._task = self._progress.add_task("train", total=steps, completed=start, loss="-", rate="", memory="")
         if self._main:

@@ -117,6 +117,9 @@ class Trainer:
             self.parameters, lr=config.optimiser.learning_rate, betas=config.optimiser.betas,
             eps=config.optimiser.epsilon, weight_decay=config.optimiser.weight_decay,
         )  # fmt: skip
+        self.draws_inside = any(
+            isinstance(one, torch.nn.Dropout) and one.p > 0 for one in self.backbone.denoiser.modules()
+        )
         self.step = 0
         self.loader, self.loader_start = self._resume(resume)
 
@@ -240,8 +243,9 @@ class Trainer:
 
     def _backward(self, batch: TrainingBatch) -> torch.Tensor:
         device, config = self.accelerator.device, self.config
-        # Dropout inside the network is keyed as well: by step and clips, not by process.
-        torch.manual_seed(keyed_seed(config.seed, self.step, *batch.keys, "network"))
+        if self.draws_inside:
+            # Keyed as well: by step and clips, not by process.
+            torch.manual_seed(keyed_seed(config.seed, self.step, *batch.keys, "network"))
         sigma_B = self.backbone.sigma_from_normal(batch.normal_B, target_shape=batch.inputs.target_shape)
         losses_B = self.backbone.losses(
             batch.inputs.to(device), batch.target_BCFHW.to(device), noise_BCFHW=batch.noise_BCFHW.to(device),
