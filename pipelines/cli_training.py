@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.cli_options import MEASURE, TRAIN, Extractors, JobFolder, Models
+from pipelines.cli_options import MEASURE, TRAIN, Effort, Extractors, JobFolder, Models
 
 commands = typer.Typer()
 
@@ -89,6 +89,38 @@ def generate(
         out=out, motion=motion, appearance=appearance, end_to_end=end_to_end, image=image, caption=caption,
         skeleton=skeleton, ego=ego, data=data, clip=clip, options=options,
     )  # fmt: skip
+
+
+@commands.command(rich_help_panel=MEASURE)
+def evaluate(
+    job: JobFolder,
+    samples: Annotated[Path, typer.Option(help="Folder of generated videos, <key>[_n].mp4, whoever made them.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="By default SAMPLES/evaluation.")] = None,
+    true_skeletons: Annotated[
+        Path | None, typer.Option(help="Samples painted over the true skeletons: what the motion stage costs.")
+    ] = None,
+    trajectories: Annotated[
+        Path | None, typer.Option(help="Folder of <key>[_n].tum, instead of the project's own ego-motion.")
+    ] = None,
+    skeletons: Annotated[Path | None, typer.Option(help="Skeleton videos; by default SAMPLES/skeleton.")] = None,
+    samples_per_clip: Annotated[int, typer.Option(min=1, help="Samples of a clip that count: 6 for minADE6.")] = 6,
+    seconds: Annotated[float | None, typer.Option(help="Compare no more than this of each clip.")] = None,
+    object_variant: Annotated[int | None, typer.Option(help="The object video that was given.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Compare pictures and read skeletons every so many frames.")] = 8,
+    extractors: Extractors = None,
+    models: Models = None,
+    effort: Effort = None,
+) -> None:
+    """Generated videos against the job's clips, beside a noise floor and baselines."""
+    from pipelines.evaluate import EvaluateOptions
+    from pipelines.evaluate_console import show_evaluation
+
+    options = EvaluateOptions(
+        out=out, true_skeletons=true_skeletons, trajectories=trajectories, skeletons=skeletons,
+        samples_per_clip=samples_per_clip, seconds=seconds, object_variant=object_variant, every=every,
+        extractors=tuple(extractors.split(",")) if extractors else None, models_dir=models, effort=effort,
+    )  # fmt: skip
+    raise typer.Exit(show_evaluation(job, samples, options))
 
 
 @commands.command(rich_help_panel=MEASURE)
