@@ -1,6 +1,7 @@
 """Clips with exact truth for the ego-motion chart and stability table: KITTI 03 and rendered street drives."""
 
 import os
+from dataclasses import replace
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -50,6 +51,20 @@ def kitti_clip(*, scale: float = 0.5, frames: int = 300) -> EgoClip:
 
 
 @cache
+def kitti_part() -> EgoClip | None:
+    """The first 12 s of KITTI 03 at half size, cut to even sides; None where it is absent."""
+    try:
+        clip = kitti_clip(frames=120)
+    except DataError:
+        return None
+    width, height = clip.intrinsics.width // 2 * 2, clip.intrinsics.height // 2 * 2
+    return replace(
+        clip, frames=[frame[:height, :width].copy() for frame in clip.frames],
+        intrinsics=replace(clip.intrinsics, width=width, height=height),
+    )  # fmt: skip
+
+
+@cache
 def street_clip(
     scenario: Scenario, *, frames: int = 24 * SECONDS, seed: int = 1, pitch_deg: float = 0.0, fps: float = 24.0
 ) -> EgoClip:
@@ -84,21 +99,27 @@ def _rendered(config: StreetConfig, name: str) -> EgoClip:
     )  # fmt: skip
 
 
-def rolling_clip(*, frames: int = 40, readout_s: float = 0.03, bands: int = 6) -> EgoClip:
-    """A sharp turn through a rolling shutter: each frame's rows in bands, each band at its own time."""
-    fine = 8
+def rolling_clip(*, start: int = 36, frames: int = 40, readout_s: float = 0.03, bands: int = 6) -> EgoClip:
+    """The middle of a sharp turn through a rolling shutter: each frame's rows in bands, each band at its own time.
+
+    It starts where the turn is well under way: while a turn begins, half a readout is a share of the yaw so far.
+    """
+    fine = 16
     street = Street(
-        StreetConfig(seed=1, width=WIDTH, height=HEIGHT, frames=frames * fine, scenario="sharp_turn", fps=24.0 * fine)
-    )
+        StreetConfig(
+            seed=1, width=WIDTH, height=HEIGHT, frames=(start + frames + 1) * fine, scenario="sharp_turn",
+            fps=24.0 * fine,
+        )
+    )  # fmt: skip
     pictures = []
-    for index in range(frames):
+    for index in range(start, start + frames):
         picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         for band in range(bands):
-            late = round(band / bands * readout_s * 24 * fine)
+            late = round((band + 0.5) / bands * readout_s * 24 * fine)
             rows = slice(band * HEIGHT // bands, (band + 1) * HEIGHT // bands)
             picture[rows] = street.render(index * fine + late).rgb[rows]
         pictures.append(picture)
-    middle = round(0.5 * readout_s * 24 * fine)
+    middle = start * fine + round(0.5 * readout_s * 24 * fine)
     return EgoClip(
         name="rolling shutter", frames=pictures, times_s=np.arange(frames) / 24, intrinsics=street.intrinsics,
         truth=street.trajectory.cam_to_world[middle::fine][:frames],
