@@ -234,12 +234,15 @@ def inspect(
     job: JobFolder,
     key: Annotated[str | None, typer.Argument(help="A clip; without one, the whole dataset in numbers.")] = None,
     sheet: Annotated[Path | None, typer.Option(help="Write the clip's contact sheet here.")] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option(help="Write the clip's way from above, its speed and yaw rate here (.png).")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """The dataset in numbers, or one clip's record and contact sheet."""
+    """The dataset in numbers, or one clip's record, contact sheet and trajectory."""
     from pipelines.status import inspect as inspect_job
 
-    raise typer.Exit(inspect_job(job, key, sheet=sheet, as_json=as_json))
+    raise typer.Exit(inspect_job(job, key, sheet=sheet, trajectory=trajectory, as_json=as_json))
 
 
 @app.command(rich_help_panel=LOOK)

@@ -165,21 +165,28 @@ def failure_lines(root: Path, *, most: int = 20) -> list[str]:
     return lines[:most] + ([f"... and {len(lines) - most} more"] if len(lines) > most else [])
 
 
-def inspect(root: Path, key: str | None, *, sheet: Path | None = None, as_json: bool = False) -> int:
-    """The dataset's summary, or a clip's record and contact sheet.
+def inspect(
+    root: Path, key: str | None, *, sheet: Path | None = None, trajectory: Path | None = None, as_json: bool = False
+) -> int:
+    """The dataset's summary, or a clip's record, contact sheet and trajectory.
 
     Raises:
         AnimaticError: no job, no such clip, a clip that was dropped, or a picture that cannot be written.
     """
     if key is None:
-        if sheet is not None:
-            raise ConfigError(f"--sheet shows one clip; name it, such as {_some_key(root)}")
+        if sheet is not None or trajectory is not None:
+            option = "--sheet" if sheet is not None else "--trajectory"
+            raise ConfigError(f"{option} shows one clip; name it, such as {_some_key(root)}")
         summary = summarize(root)
         print_json(asdict(summary)) if as_json else _print_summary(root, summary)
         return 0
     sample = find_sample(root, key)
     if sheet is not None:
         write_contact_sheet(sample, sheet)
+    if trajectory is not None:
+        from dataset.trajectory_picture import write_trajectory_picture
+
+        write_trajectory_picture(root, key, trajectory)
     record = clip_record(sample)
     if as_json:
         print_json(record)
@@ -187,6 +194,8 @@ def inspect(root: Path, key: str | None, *, sheet: Path | None = None, as_json: 
         _print_record(record)
         if sheet is not None:
             make_console().print(f"contact sheet: {sheet}")
+        if trajectory is not None:
+            make_console().print(f"trajectory: {trajectory}")
     return 0
 
 

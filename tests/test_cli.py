@@ -95,6 +95,8 @@ def test_inspect_gives_a_summary_a_record_and_a_sheet(run, job, tmp_path):
     assert record["caption"] and record["members"]["rgb.mp4"] > 0
     sheet = cv2.imread(str(tmp_path / "s.png"))
     assert sheet is not None and sheet.shape[1] > 2000
+    code, out, _ = run("inspect", job, "street_8", "--trajectory", tmp_path / "t.png")
+    assert code == 0 and "trajectory:" in out and (tmp_path / "t.png").is_file()
     assert json.loads(run("inspect", job, "--json")[1])["packed"] == {"train": 2, "val": 0}
 
 
@@ -102,6 +104,7 @@ def test_a_clip_that_is_not_there_is_named(run, job, tmp_path):
     code, _, err = run("inspect", job, "street_9")
     assert code == 2 and "has no clip 'street_9'" in err and err.count("\n") == 1
     assert run("inspect", job, "--sheet", tmp_path / "s.png")[0] == 2
+    assert run("inspect", job, "--trajectory", tmp_path / "t.png")[0] == 2
     assert run("inspect", job, "street_0", "--sheet", tmp_path / "none" / "s.png")[0] == 2
 
 

@@ -1,0 +1,115 @@
+"""The picture of a clip's trajectory: its numbers, and that it can be drawn of whatever a clip may be."""
+
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from ego_fixtures import driven
+from matplotlib.figure import Figure
+
+from dataset.selection import ClipRow, Selection, write_selection
+from dataset.tables import EgoTable, read_ego, write_ego
+from dataset.trajectory_picture import (
+    MODE_COLOURS,
+    clip_motion,
+    draw_trajectory,
+    sliced,
+    speeds_m_s,
+    write_trajectory_picture,
+    yaw_rates_deg_s,
+)
+from labeling.camera import Trajectory, prior_intrinsics
+from labeling.ego_motion import EgoMotion, RoadView
+from labeling.errors import DataError
+
+
+def stored(path: Path, poses: np.ndarray, *, modes: str = "moving", confidence: float = 1.0) -> EgoTable:
+    count = len(poses)
+    motion = EgoMotion(
+        trajectory=Trajectory(timestamps_s=10 + np.arange(count) / 24, cam_to_world=poses),
+        mode=np.full(count, modes), confidence=np.full(count, confidence, np.float32),
+        scale_source=np.full(count, "road"), scale_sigma=np.full(count, 0.1, np.float32),
+        intrinsics=prior_intrinsics(96, 64), road=RoadView(height_m=1.5, pitch_rad=0.02, pitch_sigma_rad=np.inf),
+    )  # fmt: skip
+    write_ego(path, motion, first_frame=48)
+    return read_ego(path)
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory):
+    """A labelled run [48, 96) that holds one clip, another clip without a run, and a dropped one."""
+    root = tmp_path_factory.mktemp("job")
+    (root / "videos" / "v").mkdir(parents=True)
+    stored(root / "videos" / "v" / "run_48_96.ego.parquet", driven(np.full(48, 6.0), 20.0))
+    rows = [ClipRow(key=f"v_{start}", video_id="v", start=start, end=start + 24) for start in (56, 200)]
+    rows.append(ClipRow(key="v_300", video_id="v", start=300, end=324, kept=False, reason="objects=1 < threshold=3"))
+    selection = Selection(rows=tuple(rows), threshold=None, sample_cutoff=None, digests={}, rule_digest="r")
+    write_selection(root / "selection.parquet", selection)
+    return root
+
+
+def test_a_clip_s_motion_is_its_run_s_from_its_own_start(job):
+    ego = clip_motion(job, "v_56")
+    assert ego.frame.tolist() == list(range(56, 80))
+    assert len(ego.mode) == len(ego.confidence) == len(ego.scale_sigma) == 24
+    assert ego.trajectory.timestamps_s[0] == 0 and np.array_equal(ego.trajectory.cam_to_world[0], np.eye(4))
+    assert speeds_m_s(ego) == pytest.approx(np.full(24, 6.0), rel=1e-6)
+    assert yaw_rates_deg_s(ego) == pytest.approx(np.full(24, 20.0), rel=1e-6)
+
+
+@pytest.mark.parametrize("speed", [-3.0, 0.0, 8.0], ids=str)
+def test_speed_has_the_sign_of_where_the_camera_looks(tmp_path, speed):
+    ego = stored(tmp_path / "e.parquet", driven(np.full(10, speed), -90.0))
+    assert speeds_m_s(ego) == pytest.approx(np.full(10, speed), abs=1e-6)
+    assert yaw_rates_deg_s(ego)[1:] == pytest.approx(np.full(9, -90.0), rel=1e-6)
+
+
+def test_a_clip_without_a_trajectory_says_why(job):
+    with pytest.raises(DataError, match="animatic ego"):
+        clip_motion(job, "v_200")
+    with pytest.raises(DataError, match="objects=1 < threshold=3"):
+        clip_motion(job, "v_300")
+    with pytest.raises(DataError, match="has no clip"):
+        clip_motion(job, "v_1")
+
+
+def pixels(figure: Figure) -> np.ndarray:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    picture = cv2.imdecode(np.frombuffer(stream.getvalue(), np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert picture is not None
+    return picture
+
+
+def shown(picture: np.ndarray, colour: str) -> int:
+    wanted = np.array([int(colour[at : at + 2], 16) for at in (1, 3, 5)])
+    return int((np.abs(picture.astype(int) - wanted).max(axis=-1) <= 3).sum())
+
+
+def test_modes_have_their_colours_and_doubt_pales_them(tmp_path):
+    drive = driven(np.full(30, 6.0), 20.0)
+    sure = pixels(draw_trajectory(stored(tmp_path / "a", drive), title="a"))
+    unsure = pixels(draw_trajectory(stored(tmp_path / "b", drive, confidence=0.1), title="b"))
+    held = pixels(draw_trajectory(stored(tmp_path / "c", drive, modes="held"), title="c"))
+    blue, pink = MODE_COLOURS["moving"], MODE_COLOURS["held"]
+    assert shown(sure, blue) > 5 * shown(unsure, blue) and shown(sure, blue) > 2000
+    assert shown(held, pink) > 2000 and shown(held, blue) == 0
+
+
+@pytest.mark.parametrize("count", [1, 2, 121], ids=str)
+@pytest.mark.parametrize("speed", [0.0, 30.0], ids=str)
+def test_any_clip_can_be_drawn_the_same_twice(tmp_path, count, speed):
+    ego = stored(tmp_path / "e.parquet", driven(np.full(count, speed)), confidence=0.0)
+    first, second = (pixels(draw_trajectory(sliced(ego, 0, count), title="k")) for _ in range(2))
+    assert np.array_equal(first, second) and first.shape == (1100, 1210, 3)
+
+
+def test_a_picture_that_cannot_be_written_is_an_error(job, tmp_path):
+    write_trajectory_picture(job, "v_56", tmp_path / "t.png")
+    assert (tmp_path / "t.png").stat().st_size > 10_000
+    with pytest.raises(DataError, match="end it in .png"):
+        write_trajectory_picture(job, "v_56", tmp_path / "t.nonsense")
+    with pytest.raises(DataError, match="folder that is there"):
+        write_trajectory_picture(job, "v_56", tmp_path / "none" / "t.png")
