@@ -141,7 +141,7 @@ def evaluate(
     report = build_report(results)
     notes = (
         *clip_notes(splits, folders, options.samples_per_clip), *ruler_notes(ruler.choice, options.trajectories),
-        *result_notes(report, longest_s=_longest_s([clips[key] for key in keys])),
+        *result_notes(report, results, longest_s=_longest_s([clips[key] for key in keys])),
     )  # fmt: skip
     record = {
         "job": job.resolve().name, "samples": samples.resolve().name, "ruler": ruler.as_json(), "notes": notes,

@@ -15,7 +15,7 @@ _HEADS = {
     SAMPLES: "samples", TRUE_SKELETONS: "over true skeletons", "truth video": "truth video\n(noise floor)",
     "constant velocity": "constant\nvelocity", "first frame": "first frame\nheld",
 }  # fmt: skip
-_ARROWS = {"lower": "[dim]less is better[/]", "higher": "[dim]more is better[/]", "neither": "[dim]diversity[/]"}
+_BETTER = {"lower": "less", "higher": "more", "neither": ""}
 
 
 def show_evaluation(job: Path, samples: Path, options: EvaluateOptions) -> int:
@@ -50,24 +50,27 @@ def described(report: Report) -> str:
 
 
 def figure_table(report: Report, *, title: str = "") -> Table:
-    """Figures down, sets across; means with 95 % intervals over source videos, and clips where not all count."""
+    """Figures down, sets across: means, 95 % intervals over source videos for what is judged, clips if not all count."""
     shown = [name for name, summary in report.sets.items() if summary.samples]
     attributed = TRUE_SKELETONS in shown
     table = Table(title=escape(title), title_justify="left", box=None, pad_edge=False)
     table.add_column("", style="bold")
+    table.add_column("better", style="dim")
     for name in shown:
         table.add_column(_HEADS.get(name, name), justify="right")
     if attributed:
-        table.add_column("predicted less\ntrue skeletons", justify="right")
-    table.add_column("")
+        table.add_column("samples less\nover true skeletons", justify="right")
     for figure in FIGURES:
         if not any(figure.name in report.sets[name].figures for name in shown):
             continue
-        cells = [_cell(report.sets[name], figure, clips=report.clips) for name in shown]
+        cells = [
+            _cell(report.sets[name], figure, clips=report.clips, judged=name in (SAMPLES, TRUE_SKELETONS))
+            for name in shown
+        ]
         if attributed:
             difference = report.differences[TRUE_SKELETONS].get(figure.name)
             cells.append("" if difference is None else _interval(difference, figure, signed=True))
-        table.add_row(_label(figure, report.sets[SAMPLES]), *cells, _ARROWS[figure.better])
+        table.add_row(_label(figure, report.sets[SAMPLES]), _BETTER[figure.better], *cells)
     return table
 
 
@@ -93,12 +96,13 @@ def _label(figure: Figure, judged: SetSummary) -> str:
     return f"{figure.label.format(k=count)}{unit}"
 
 
-def _cell(summary: SetSummary, figure: Figure, *, clips: int) -> str:
+def _cell(summary: SetSummary, figure: Figure, *, clips: int, judged: bool) -> str:
     found = summary.figures.get(figure.name)
     if found is None:
         return "[dim]-[/]"
     some = summary.clips[figure.name]
-    return _interval(found, figure) + ("" if some == clips else f" [dim]{some}c[/]")
+    text = _interval(found, figure) if judged else f"{found.mean:.{figure.digits}f}"
+    return text + ("" if some == clips else f" [dim]({some} clips)[/]")
 
 
 def _interval(found: Interval, figure: Figure, *, signed: bool = False) -> str:

@@ -1,11 +1,11 @@
 """What a reader of an evaluation has to know beside its figures: what was left out, and what rests on what."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from labeling.extractors import ExtractorChoice
 from training.evaluation_files import SampleFolder
-from training.evaluation_report import SAMPLES, TRUE_SKELETONS, Report
+from training.evaluation_report import SAMPLES, TRUE_SKELETONS, ClipResult, Report
 
 _FEW_VIDEOS = 5
 
@@ -51,11 +51,12 @@ def ruler_notes(choice: ExtractorChoice, trajectories: Path | None) -> list[str]
     return notes
 
 
-def result_notes(report: Report, *, longest_s: float) -> list[str]:
+def result_notes(report: Report, results: Sequence[ClipResult], *, longest_s: float) -> list[str]:
     """How long the comparison is, in which geometry, and how far intervals can be trusted.
 
     Args:
         report: the figures.
+        results: by clip.
         longest_s: duration of the longest clip, seconds.
     """
     judged = report.sets[SAMPLES]
@@ -63,6 +64,12 @@ def result_notes(report: Report, *, longest_s: float) -> list[str]:
     if judged.seconds[0] < longest_s - 1e-3:
         span = " to ".join(f"{one:.2f}" for one in dict.fromkeys(judged.seconds))
         notes.append(f"compared over {span} s, which truth and samples share; clips last up to {longest_s:.2f} s")
+    used = [result.sets[SAMPLES].score.samples.get("min_ade_m", 0) for result in results]
+    if sum(used) < judged.samples:
+        notes.append(
+            f"trajectories were found in {sum(used)} of {judged.samples} samples: minADE and APD rest on "
+            f"{sum(used) / len(used):.1f} samples of a clip, and fewer samples make minADE larger"
+        )
     if len(judged.geometries) > 1:
         notes.append(
             f"samples are of {len(judged.geometries)} frame rates, sizes or lengths; each is judged at its own"

@@ -66,7 +66,7 @@ class SampleEstimate:
     """Cars that the sample's skeleton video shows, in the same pixels, in the frames of ``skeleton_frames``."""
     skeleton_frames: tuple[int, ...] = ()
     psnr_db: np.ndarray | None = None
-    """(n,) against the truth at the same time; NaN after its end."""
+    """(n,) against the truth at the same time; NaN after its end, and where they were not compared."""
     ssim: np.ndarray | None = None
     faults: Mapping[str, str] = field(default_factory=dict)
     """Reason by part."""
@@ -206,7 +206,7 @@ def label_scores(truth: ClipTruth, sample: SampleEstimate, *, end_s: float) -> d
 
 
 def picture_scores(sample: SampleEstimate, *, end_s: float) -> dict[str, float]:
-    """``psnr_db`` and ``ssim``, means over the frames that the truth has too."""
+    """``psnr_db`` and ``ssim``, means over the frames that were compared and that the truth has too."""
     inside = sample.times_s <= end_s + 1e-6
     scores = {}
     for name, values in (("psnr_db", sample.psnr_db), ("ssim", sample.ssim)):

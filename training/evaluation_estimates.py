@@ -103,7 +103,7 @@ class ClipEstimator:
             video = read_sample(files.rgb)
         except AnimaticError as error:
             nothing = SampleEstimate(name=name, times_s=np.zeros(0), width=0, height=0)
-            return with_fault(nothing, "video", _reason(error))
+            return with_fault(nothing, "video", _reason(error, files.rgb))
         found = self._labelled(name, video)
         found = self._with_trajectory(found, video, files)
         found = self._with_pictures(found, video)
@@ -156,7 +156,7 @@ class ClipEstimator:
         try:
             poses = imported_poses(files.trajectory, video.times_s, intrinsics=self._intrinsics)
         except AnimaticError as error:
-            return with_fault(found, "ego", _reason(error))
+            return with_fault(found, "ego", _reason(error, files.trajectory))
         return replace(found, cam_to_world=poses)
 
     def _with_ego(self, found: SampleEstimate, video: SampleVideo) -> SampleEstimate:
@@ -186,7 +186,8 @@ class ClipEstimator:
     def _with_pictures(self, found: SampleEstimate, video: SampleVideo) -> SampleEstimate:
         psnr, ssim = np.full(len(video.frames), np.nan), np.full(len(video.frames), np.nan)
         nearest = nearest_frames(self.truth.times_s, video.times_s)
-        for frame in self._looks(len(video.frames)):
+        # The first frame is given to every generator; the last one stands for clips shorter than a step.
+        for frame in self._looks(len(video.frames))[1:] or [len(video.frames) - 1]:
             if video.times_s[frame] <= self.truth.times_s[-1] + 1e-6:
                 true = covered(self.pictures[nearest[frame]], width=found.width, height=found.height)
                 psnr[frame], ssim[frame] = picture_similarity(video.frames[frame][None], true[None])
@@ -202,7 +203,7 @@ class ClipEstimator:
             looks = set(self._looks(count))
             drawn = {frame: picture for frame, picture in enumerate(read_frames(path)) if frame in looks}
         except AnimaticError as error:
-            return with_fault(found, "skeleton", _reason(error))
+            return with_fault(found, "skeleton", _reason(error, path))
         return self._read_back(found, drawn)
 
     def _read_back(self, found: SampleEstimate, drawn: Mapping[int, np.ndarray]) -> SampleEstimate:
@@ -256,5 +257,7 @@ def imported_poses(path: Path, times_s: np.ndarray, *, intrinsics: Intrinsics) -
     return motion.trajectory.cam_to_world
 
 
-def _reason(error: AnimaticError) -> str:
-    return " ".join(str(error).split())
+def _reason(error: AnimaticError, path: Path | None = None) -> str:
+    """The error's words on one line, files by their names: figures do not depend on where folders lie."""
+    text = " ".join(str(error).split())
+    return text.replace(f"{path.parent}/", "") if path is not None else text
