@@ -7,8 +7,9 @@ them; a network that has seen nothing for a second looks twice per second.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from labeling.carrying import UNSEEN_FRAMES, along_path, box_diagonal, carry, cl
 from labeling.extractors import Extractors
 from labeling.labels import Keypoints
 from labeling.observation import Look, looks_of
+from labeling.picture_turn import picture_turn, turn_view
 from labeling.smoothing import smooth_tracks
 from labeling.tracking import RunTracker, TrackerSettings, drop_passing_tracks
 
@@ -55,6 +57,8 @@ _WAITING_GAP = 6
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
 """What lasts less than a quarter of a second, or was seen once, is taken for a mistake."""
+_TURN_STEP = 4
+"""Frames after which two pictures of a camera that turns sharply have too little in common."""
 _NEAR_PX = 48.0
 """Objects at least this high bring looks closer together when they come or go; what is far may be seen later."""
 _BORDER_PX = 4.0
@@ -100,9 +104,9 @@ def label_with(
     settings = effort if isinstance(effort, EffortSettings) else EFFORTS[effort]
     channels = [_Channel(look, settings) for look in looks]
     for number, frame in enumerate(frames, start=first_frame):
-        grey = _Once(frame)
+        views = _Views(frame)
         for channel in channels:
-            channel.push(frame, grey, number=number, fresh=number in breaks)
+            channel.push(views, number=number, fresh=number in breaks)
     for channel in channels:
         channel.finish()
     labels = _renumbered([channel.labels for channel in channels])
@@ -110,17 +114,21 @@ def label_with(
     return smooth_tracks(labels, breaks=breaks)
 
 
-class _Once:
-    """The small grey picture of a frame, made when somebody first needs it."""
+class _Views:
+    """A frame and its small pictures, each made once, when somebody first needs it."""
 
     def __init__(self, frame: np.ndarray) -> None:
-        self._frame = frame
-        self._grey: np.ndarray | None = None
+        self.frame = frame
 
-    def __call__(self) -> np.ndarray:
-        if self._grey is None:
-            self._grey = small_grey(self._frame)
-        return self._grey
+    @cached_property
+    def grey(self) -> np.ndarray:
+        """For flow."""
+        return small_grey(self.frame)
+
+    @cached_property
+    def far(self) -> np.ndarray:
+        """For the camera's turn."""
+        return turn_view(self.frame)
 
 
 class _Channel:
@@ -139,7 +147,9 @@ class _Channel:
         self._key_frame: int | None = None
         self._paths: dict[int, list[Keypoints]] = {}
         self._grey: tuple[np.ndarray, int] | None = None
-        self._latest: tuple[np.ndarray, Callable[[], np.ndarray], int] | None = None
+        self._far: tuple[np.ndarray, int] | None = None
+        self._turned = np.eye(3)
+        self._latest: tuple[_Views, int] | None = None
         self._slippery: set[int] = set()
         self._gap = 1
         self._last_seen: int | None = None
@@ -148,30 +158,32 @@ class _Channel:
     def _flows(self) -> bool:
         return self.look.carries and self.settings.flow_step > 0
 
-    def push(self, frame: np.ndarray, grey: Callable[[], np.ndarray], *, number: int, fresh: bool) -> None:
+    def push(self, views: _Views, *, number: int, fresh: bool) -> None:
         """The next frame of the run; ``fresh`` when nothing of the one before it holds any more."""
         if fresh:
             self.finish()
             self._forget()
-        self._latest = (frame, grey, number)
+        self._latest = (views, number)
+        if self._far and number - self._far[1] >= _TURN_STEP:
+            self._turn(views, number)
         due = self._key_frame is None or number - self._key_frame >= self._gap
-        if due or not self._carry(grey, number):
-            self._look(frame, grey, number)
+        if due or not self._carry(views, number):
+            self._look(views, number)
 
     def finish(self) -> None:
         """The run, or what came before a cut, ends: its last frame is looked at, so that nothing carried stays open."""
-        if self._latest and self._latest[2] != self._key_frame:
+        if self._latest and self._latest[1] != self._key_frame:
             self._look(*self._latest)
 
-    def _carry(self, grey: Callable[[], np.ndarray], number: int, *, arriving: bool = False) -> bool:
+    def _carry(self, views: _Views, number: int, *, arriving: bool = False) -> bool:
         """Carry the last look's objects on where a step is due; False when one of them was lost on the way."""
         if not self._grey or not self._paths:
             return True
         previous, since = self._grey
         if number - since < (1 if arriving else self.settings.flow_step):
             return True
-        carried = carry(previous, grey(), [path[-1] for path in self._paths.values()], frame=number)
-        self._grey = (grey(), number)
+        carried = carry(previous, views.grey, [path[-1] for path in self._paths.values()], frame=number)
+        self._grey = (views.grey, number)
         for path, moved in zip(self._paths.values(), carried, strict=True):
             path.append(moved.label)
         if arriving:
@@ -188,10 +200,13 @@ class _Channel:
         self._slippery |= lost
         return not lost & set(inside)
 
-    def _look(self, frame: np.ndarray, grey: Callable[[], np.ndarray], number: int) -> None:
+    def _look(self, views: _Views, number: int) -> None:
         if self._key_frame is not None and number - self._key_frame > 1:
-            self._carry(grey, number, arriving=True)
-        seen = self._tracker.update(self.look.see(frame, number), frame=number)
+            self._carry(views, number, arriving=True)
+        self._turn(views, number)
+        seen = self.look.see(views.frame, number)
+        seen = self._tracker.update(seen, frame=number, previous_to_current=self._turned)
+        self._turned = np.eye(3)
         self.looks += 1
         miss = self._close(seen, number)
         self.labels += seen
@@ -200,7 +215,14 @@ class _Channel:
         self._gap = self._next_gap(seen, miss, number)
         self._key, self._key_frame = seen, number
         self._paths = {label.track_id: [label] for label in seen}
-        self._grey = (grey(), number) if self._flows and self._gap > 1 and seen else None
+        self._grey = (views.grey, number) if self._flows and self._gap > 1 and seen else None
+
+    def _turn(self, views: _Views, number: int) -> None:
+        """Add the camera's turn up to this frame to what it turned since the last look."""
+        if self._far is not None:
+            height, width = views.frame.shape[:2]
+            self._turned = picture_turn(self._far[0], views.far, width=width, height=height) @ self._turned
+        self._far = (views.far, number)
 
     def _close(self, seen: list[Keypoints], number: int) -> float:
         """Labels between the last look and this one; returns the median miss of carried points, in box diagonals."""

@@ -13,7 +13,9 @@ from scipy.optimize import linear_sum_assignment
 
 from labeling.labels import POINT_DETECTED, UNTRACKED, Keypoints
 
-_FORBIDDEN = 1e6
+_UNMATCHED = 1.0
+"""Cost of a box or a track that is left alone: what a match of no overlap would cost. Were it more, a whole row of
+parked cars would change places rather than leave one out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +111,7 @@ class BoxTracker:
         overlap = iou(_grown(predicted, buffer), _grown(boxes[chosen], buffer))
         heights = np.log(_heights(boxes[chosen])[None] / _heights(predicted)[:, None])
         allowed = (overlap >= self.settings.min_overlap) & (np.abs(heights) <= np.log(self.settings.max_size_ratio))
-        rows, columns = linear_sum_assignment(np.where(allowed, 1 - overlap, _FORBIDDEN))
+        rows, columns = linear_sum_assignment(np.where(allowed, 1 - overlap, _UNMATCHED))
         taken = np.zeros(len(chosen), bool)
         for row, column in zip(rows, columns, strict=True):
             if allowed[row, column]:
@@ -217,13 +219,20 @@ class LaneTracker:
         self.max_distance_px, self.max_lost_frames = max_distance_px, max_lost_frames
         self._lines: dict[int, tuple[np.ndarray, int]] = {}
 
-    def update(self, lines: Sequence[np.ndarray], *, frame_step: int = 1) -> np.ndarray:
-        """Ids for the lines of the next frame, each (K, 3) x, y, score in pixels; absent points have score 0."""
+    def update(
+        self, lines: Sequence[np.ndarray], *, frame_step: int = 1, previous_to_current: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Ids for the lines of the next frame, each (K, 3) x, y, score in pixels; absent points have score 0.
+
+        ``frame_step`` and ``previous_to_current`` are as ``BoxTracker.update`` takes them.
+        """
+        if previous_to_current is not None:
+            self._lines = {i: (_turned(line, previous_to_current), age) for i, (line, age) in self._lines.items()}
         ids = np.full(len(lines), UNTRACKED)
         known = sorted(self._lines)
         if known and len(lines):
             cost = np.array([[line_distance(self._lines[i][0], line) for line in lines] for i in known])
-            rows, columns = linear_sum_assignment(np.minimum(cost, _FORBIDDEN))
+            rows, columns = linear_sum_assignment(np.minimum(cost, self.max_distance_px))
             for row, column in zip(rows, columns, strict=True):
                 if cost[row, column] <= self.max_distance_px:
                     ids[column] = known[row]
@@ -275,7 +284,7 @@ def _update(
     tracker: BoxTracker | LaneTracker, group: list[Keypoints], step: int, turn: np.ndarray | None
 ) -> np.ndarray:
     if isinstance(tracker, LaneTracker):
-        return tracker.update([label.points for label in group], frame_step=step)
+        return tracker.update([label.points for label in group], frame_step=step, previous_to_current=turn)
     boxes = np.array([label.box_xyxy for label in group], np.float64).reshape(-1, 4)
     scores = np.array([label.score for label in group])
     return tracker.update(boxes, scores, frame_step=step, previous_to_current=turn)
@@ -320,6 +329,12 @@ def _correct(track: _Track, box_xyxy: np.ndarray) -> None:
     track.mean = track.mean + gain * innovation[:, None]
     track.covariance = track.covariance - gain[:, :, None] * track.covariance[:, :1, :]
     track.lost_frames = 0
+
+
+def _turned(line: np.ndarray, previous_to_current: np.ndarray) -> np.ndarray:
+    """A line (K, 3) of x, y, score where the camera's turn takes it."""
+    moved = np.concatenate([line[:, :2], np.ones((len(line), 1))], axis=1) @ previous_to_current.T
+    return np.concatenate([moved[:, :2] / moved[:, 2:], line[:, 2:]], axis=1)
 
 
 def _move_with_camera(track: _Track, previous_to_current: np.ndarray) -> None:

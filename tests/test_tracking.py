@@ -127,3 +127,12 @@ def test_line_distance_is_the_horizontal_gap() -> None:
 def test_iou_by_hand() -> None:
     boxes = np.array([[0, 0, 2, 2.0], [1, 1, 3, 3.0]])
     assert iou(boxes, boxes) == pytest.approx(np.array([[1, 1 / 7], [1 / 7, 1]]))
+
+
+def test_a_row_of_parked_cars_does_not_move_up_by_one() -> None:
+    """One of a row is missed while another comes into view: everyone else keeps their place."""
+    tracker = BoxTracker()
+    row = [np.array([x, 300, x + 80, 360.0]) for x in range(100, 600, 50)]
+    ids = [tracker.update(np.array(row[:-1]), np.ones(9)).tolist() for _ in range(5)][-1]
+    later = tracker.update(np.array(row[1:]), np.ones(9)).tolist()
+    assert later[:-1] == ids[1:] and later[-1] not in ids

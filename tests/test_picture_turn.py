@@ -1,0 +1,39 @@
+"""The camera's turn from small pictures of a textured world that only turns."""
+
+import cv2
+import numpy as np
+import pytest
+
+from labeling.camera import prior_intrinsics
+from labeling.picture_turn import picture_turn, turn_view
+
+WIDTH, HEIGHT = 528, 352
+
+
+def turned_view(yaw_deg: float, pitch_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """A far wall before and after a turn (positive: things move right and down), and the true homography."""
+    noise = np.random.default_rng(3).integers(0, 256, (HEIGHT // 8, WIDTH // 8, 3), dtype=np.uint8)
+    wall = cv2.resize(noise, (WIDTH * 3, HEIGHT * 3), interpolation=cv2.INTER_CUBIC)
+    camera = prior_intrinsics(WIDTH, HEIGHT)
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    down, _ = cv2.Rodrigues(np.radians([-pitch_deg, 0.0, 0.0]))
+    across, _ = cv2.Rodrigues(np.radians([0.0, yaw_deg, 0.0]))
+    turn = matrix @ across @ down @ np.linalg.inv(matrix)
+    middle = np.array([[1.0, 0, -WIDTH], [0, 1, -HEIGHT], [0, 0, 1]])
+    pictures = [cv2.warpPerspective(wall, motion @ middle, (WIDTH, HEIGHT)) for motion in (np.eye(3), turn)]
+    return np.stack(pictures), turn
+
+
+@pytest.mark.parametrize(("yaw_deg", "pitch_deg"), [(0, 0), (1.25, 0), (-6, 0.5), (9, -1)])
+def test_far_points_go_where_the_turn_takes_them(yaw_deg: float, pitch_deg: float) -> None:
+    (before, after), turn = turned_view(yaw_deg, pitch_deg)
+    found = picture_turn(turn_view(before), turn_view(after), width=WIDTH, height=HEIGHT)
+    spots = np.array([[60.0, 180, 1], [264, 176, 1], [460, 200, 1]])
+    gaps = [(spots @ motion.T)[:, :2] / (spots @ motion.T)[:, 2:] for motion in (found, turn)]
+    assert np.abs(gaps[0] - gaps[1]).max() < 3.0
+
+
+def test_pictures_with_nothing_in_common_turn_nothing() -> None:
+    rng = np.random.default_rng(0)
+    views = [turn_view(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)) for _ in range(2)]
+    np.testing.assert_array_equal(picture_turn(*views, width=WIDTH, height=HEIGHT), np.eye(3))
