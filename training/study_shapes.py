@@ -1,7 +1,7 @@
 """General moving-shape videos: what the study's little video model is taught before it ever sees a street.
 
-Half of them are scenes (ellipses, boxes, polygons that drift, grow and turn over a background that pans and zooms), half
-are drawings on black (thin coloured lines, dots, flat boxes). Video ``i`` is a pure function of (seed, i).
+Half of them are scenes (ellipses, boxes, polygons that drift, grow and turn over a background that pans and zooms), the
+rest drawings on black (thin coloured lines, dots, flat boxes). Video ``i`` is a pure function of (seed, i).
 """
 
 from collections.abc import Callable
@@ -38,8 +38,10 @@ def _background(rng: np.random.Generator, frames: int, width: int, height: int) 
     top, bottom = rng.uniform(20, 235, (2, 1, 1, 3))
     shade = np.linspace(0, 1, sides[1])[:, None, None] ** rng.uniform(0.4, 2.5)
     texture = np.broadcast_to(top + (bottom - top) * shade, (sides[1], sides[0], 3)).astype(np.float32)
-    for cells in (5, 12, 40):
-        rough = rng.normal(0, rng.uniform(0, 22), (cells, 2 * cells, 3 if rng.random() < 0.5 else 1)).astype(np.float32)
+    for cells, most in ((5, 25), (12, 20), (30, 8)):
+        rough = rng.normal(0, rng.uniform(0, most), (cells, 2 * cells, 3 if rng.random() < 0.5 else 1)).astype(
+            np.float32
+        )
         layer = cv2.resize(rough, sides, interpolation=cv2.INTER_LINEAR)
         texture = texture + (layer if layer.ndim == 3 else layer[..., None])
     if rng.random() < 0.5:
