@@ -1,12 +1,11 @@
-"""Two-stage sampling: image and text -> skeleton video -> RGB video, both adapters on one backbone.
+"""Generating from the command line: what a person gives becomes conditions, and samples become files.
 
-Latents pass from the motion to the appearance stage without a decode in between where both were trained at the same
-control size; else they are decoded, resized and encoded. The same seed gives the same files.
+The sampling itself is ``clip_generator``'s. The same seed gives the same files.
 """
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,55 +13,36 @@ import numpy as np
 import torch
 
 from dataset.receipts import storage_errors
-from labeling.camera import Intrinsics, Trajectory
+from labeling.camera import Intrinsics, Trajectory, write_tum
 from labeling.encoding import VideoWriter, lossless_rgb
 from labeling.errors import ConfigError
-from training.adapters import AdapterFile, activate_adapter, read_adapter
-from training.backbone import Backbone, SamplingSettings, TextEmbedding
+from training.adapters import read_adapter
+from training.backbone import Backbone, SamplingSettings
 from training.backbones import load_backbone
-from training.config import BackboneConfig, PictureConfig, Stage, backbone_config
-from training.draws import keyed_normal, keyed_seed
+from training.clip_generator import ClipConditions, ClipGenerator, GeneratedClip
+from training.config import BackboneConfig, Stage, backbone_config
 from training.sampling_inputs import (
     LabelledFrame,
     control_clip,
-    covered,
     ego_clip,
     ego_trajectory,
     first_skeleton,
-    fitted,
     object_clip,
     read_image,
 )
-from training.stages import EGO, IMAGE, OBJECTS, stage_inputs
 
-_DEFAULT_FRAMES = 121
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ClipConditions:
-    """What one clip is generated from, as pictures; sizes are brought to the backbone's by the generator."""
-
-    image: np.ndarray
-    """(H, W, 3) uint8 RGB: the first frame."""
-    caption: str
-    first_control: np.ndarray | None = None
-    """(H, W, 3): the first skeleton; needed by the motion stage."""
-    ego: np.ndarray | None = None
-    """(T, H, W, 3) ego video."""
-    objects: np.ndarray | None = None
-    """(T, H, W, 3) object video."""
-    control: np.ndarray | None = None
-    """(T, H, W, 3) skeleton video; given, the motion stage is left out (the truth, for stage attribution)."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GeneratedClip:
-    """One sample."""
-
-    rgb: np.ndarray | None
-    """(T, H, W, 3) uint8; None without an appearance adapter."""
-    control: np.ndarray | None
-    """(T, H, W, 3) uint8 skeleton video; None where RGB was made end to end."""
+__all__ = [
+    "ClipConditions",
+    "ClipGenerator",
+    "GeneratedClip",
+    "GeneratedFiles",
+    "generate",
+    "open_generator",
+    "prepare_conditions",
+    "sampling_record",
+    "write_clip",
+    "write_samples",
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,157 +53,6 @@ class GeneratedFiles:
     control: Path | None
     seed: int
     number: int
-
-
-@dataclass
-class ClipGenerator:
-    """A backbone with its adapters, ready to sample clip after clip.
-
-    Args:
-        backbone: with or without adapters of other names.
-        motion: adapter file of the motion stage, or None.
-        appearance: adapter file of the appearance stage, or None.
-        end_to_end: adapter file of the baseline; excludes the other two.
-        frames: video frames; what the adapters were trained on if None.
-
-    Raises:
-        ConfigError: no adapter, or ones that exclude each other.
-        ModelError: adapters that do not fit the backbone.
-    """
-
-    backbone: Backbone
-    motion: Path | None = None
-    appearance: Path | None = None
-    end_to_end: Path | None = None
-    frames: int | None = None
-    files: dict[Stage, AdapterFile] = field(default_factory=dict, init=False)
-
-    def __post_init__(self) -> None:
-        given: dict[Stage, Path | None] = {
-            "motion": self.motion, "appearance": self.appearance, "end_to_end": self.end_to_end,
-        }  # fmt: skip
-        chosen: dict[Stage, Path] = {stage: Path(path) for stage, path in given.items() if path is not None}
-        if not chosen or ("end_to_end" in chosen and len(chosen) > 1):
-            raise ConfigError("give --motion and --appearance (either alone works too), or --end-to-end alone")
-        for stage, path in chosen.items():
-            self.files[stage] = self.backbone.load_adapter(path, stage)
-        if self.frames is None:
-            self.frames = next((f.about["frames"] for f in self.files.values() if f.about.get("frames")), None)
-        self._empty = self.backbone.encode_text([""])[0]
-        self._texts: dict[str, TextEmbedding] = {}
-
-    @property
-    def frame_count(self) -> int:
-        """Video frames of a sample."""
-        return self.frames or self.backbone.config.picture.frames or _DEFAULT_FRAMES
-
-    def picture(self, stage: Stage) -> PictureConfig:
-        """The sizes that a stage's adapter was trained at; the backbone's for foreign files."""
-        about = self.files[stage].about if stage in self.files else {}
-        told = about.get("config", {}).get("backbone", {}).get("picture")
-        return PictureConfig.model_validate(told) if told else self.backbone.config.picture
-
-    def control_name(self, stage: Stage) -> str:
-        """The intermediate representation that a stage's adapter knows."""
-        about = self.files[stage].about if stage in self.files else {}
-        return about.get("config", {}).get("conditions", {}).get("control", "skeleton")
-
-    def sample(
-        self, conditions: ClipConditions, *, seed: int = 0, number: int = 0, settings: SamplingSettings | None = None
-    ) -> GeneratedClip:
-        """One sample; ``(seed, number)`` decides it.
-
-        Raises:
-            ConfigError: a condition is missing, or sizes do not fit.
-        """
-        settings = settings or SamplingSettings()
-        if "end_to_end" in self.files:
-            latents = self._rgb(conditions, "end_to_end", None, keyed=(seed, number), settings=settings)
-            return GeneratedClip(rgb=self._decoded(latents, seed, number), control=None)
-        control = self._control(conditions, keyed=(seed, number), settings=settings)
-        shown = self._decoded(control, seed, number) if conditions.control is None else conditions.control
-        if "appearance" not in self.files:
-            return GeneratedClip(rgb=None, control=shown)
-        rgb = self._rgb(
-            conditions, "appearance", self._handed_over(control, shown), keyed=(seed, number), settings=settings
-        )
-        return GeneratedClip(rgb=self._decoded(rgb, seed, number), control=shown)
-
-    def _control(
-        self, conditions: ClipConditions, *, keyed: tuple[int, int], settings: SamplingSettings
-    ) -> torch.Tensor:
-        """Latents (C, F, H, W) of the control video: encoded where it is given, else sampled."""
-        picture = self.picture("motion" if "motion" in self.files else "appearance")
-        size = {"width": picture.control_width, "height": picture.control_height}
-        if conditions.control is not None:
-            return self.backbone.encode_video(fitted(conditions.control[: self.frame_count], **size))
-        if "motion" not in self.files or conditions.first_control is None:
-            raise ConfigError(
-                "the appearance stage needs a skeleton video: give --motion and a first skeleton, or --skeleton-video"
-            )
-        references = self._motion_references(conditions, picture)
-        references[IMAGE] = self.backbone.encode_video(covered(conditions.image, **size)[None])
-        first = self.backbone.encode_video(fitted(conditions.first_control[None], **size))
-        return self._drawn("motion", first, references, conditions, picture, keyed=keyed, settings=settings)
-
-    def _motion_references(self, conditions: ClipConditions, picture: PictureConfig) -> dict[str, torch.Tensor]:
-        given = {EGO: conditions.ego, OBJECTS: conditions.objects}
-        size = {"width": picture.control_width, "height": picture.control_height}
-        return {
-            name: self.backbone.encode_video(fitted(frames[: self.frame_count], **size))
-            for name, frames in given.items()
-            if frames is not None
-        }
-
-    def _rgb(
-        self, conditions: ClipConditions, stage: Stage, control: torch.Tensor | None, *, keyed: tuple[int, int],
-        settings: SamplingSettings,
-    ) -> torch.Tensor:  # fmt: skip
-        picture = self.picture(stage)
-        if control is not None:
-            references = {self.control_name(stage): control}
-        else:
-            references = self._motion_references(conditions, picture)
-        first = covered(conditions.image, width=picture.rgb_width, height=picture.rgb_height)[None]
-        first_latents = self.backbone.encode_video(first)
-        return self._drawn(stage, first_latents, references, conditions, picture, keyed=keyed, settings=settings)
-
-    def _drawn(
-        self, stage: Stage, first: torch.Tensor, references: dict[str, torch.Tensor], conditions: ClipConditions,
-        picture: PictureConfig, *, keyed: tuple[int, int], settings: SamplingSettings,
-    ) -> torch.Tensor:  # fmt: skip
-        shape = self.backbone.geometry.latent_shape(
-            frames=self.frame_count, height=first.shape[2] * self.backbone.geometry.spatial,
-            width=first.shape[3] * self.backbone.geometry.spatial,
-        )  # fmt: skip
-        caption = conditions.caption
-        image = covered(conditions.image, width=picture.rgb_width, height=picture.rgb_height)
-        if caption not in self._texts:
-            self._texts[caption] = self.backbone.encode_text([caption])[0]
-        inputs = stage_inputs(
-            stage, first_frame_CFHW=first, target_shape=shape, references=references, text=self._texts[caption],
-            text_tokens=self.backbone.config.text_tokens, fps=picture.fps, control=self.control_name(stage),
-            image_1D=self.backbone.encode_image(image),
-        )  # fmt: skip
-        activate_adapter(self.backbone.denoiser, stage)
-        noise = keyed_normal((1, *shape), *keyed, stage)
-        latents = self.backbone.sample(
-            inputs.to(self.backbone.device), noise_BCFHW=noise, empty_text=self._empty, settings=settings
-        )
-        return latents[0].cpu()
-
-    def _handed_over(self, control: torch.Tensor, shown: np.ndarray) -> torch.Tensor:
-        """The control's latents at the size that the appearance stage was trained with."""
-        picture = self.picture("appearance")
-        shape = self.backbone.geometry.latent_shape(
-            frames=self.frame_count, height=picture.control_height, width=picture.control_width
-        )
-        if tuple(control.shape) == shape:
-            return control
-        return self.backbone.encode_video(fitted(shown, width=picture.control_width, height=picture.control_height))
-
-    def _decoded(self, latents: torch.Tensor, seed: int, number: int) -> np.ndarray:
-        return self.backbone.decode_video(latents, seed=keyed_seed(seed, number, "decode") % 2**31)
 
 
 def generate(
@@ -282,34 +111,85 @@ def generate(
         ModelError: weights that are absent or do not fit.
         StorageError: no space left.
     """
-    loaded = _loaded_backbone(backbone, [motion, appearance, end_to_end], device)
-    generator = ClipGenerator(loaded, motion=motion, appearance=appearance, end_to_end=end_to_end, frames=frames)
-    name = name or (image.stem if isinstance(image, Path) else "sample")
+    generator = open_generator(
+        backbone, motion=motion, appearance=appearance, end_to_end=end_to_end, frames=frames, device=device
+    )
     conditions = prepare_conditions(
         generator, image=image, caption=caption, skeleton=skeleton, skeleton_video=skeleton_video, ego=ego,
         objects=objects, intrinsics=intrinsics, extractors=extractors, models_dir=models_dir,
     )  # fmt: skip
-    settings = SamplingSettings(steps=steps, guidance=guidance, coordinates=coordinates)
+    return write_samples(
+        generator, conditions, out=out, name=name or (image.stem if isinstance(image, Path) else "sample"),
+        samples=samples, seed=seed, settings=SamplingSettings(steps=steps, guidance=guidance, coordinates=coordinates),
+    )  # fmt: skip
+
+
+def open_generator(
+    backbone: str | Path | BackboneConfig | Backbone | None = None, *, motion: Path | None = None,
+    appearance: Path | None = None, end_to_end: Path | None = None, frames: int | None = None,
+    device: str | None = None,
+) -> ClipGenerator:  # fmt: skip
+    """A backbone with its adapters, loaded once for any number of clips; arguments as for ``generate``.
+
+    Raises:
+        ConfigError: no adapter, ones that exclude each other, or none that says which backbone it is for.
+        ModelError: weights that are absent or do not fit.
+    """
+    loaded = _loaded_backbone(backbone, [motion, appearance, end_to_end], device)
+    return ClipGenerator(loaded, motion=motion, appearance=appearance, end_to_end=end_to_end, frames=frames)
+
+
+def write_samples(
+    generator: ClipGenerator, conditions: ClipConditions, *, out: Path, name: str, samples: int = 1, seed: int = 0,
+    settings: SamplingSettings | None = None, about: Mapping[str, Any] | None = None,
+) -> list[GeneratedFiles]:  # fmt: skip
+    """Sample and write: ``<name>_<n>.mp4``, ``skeleton/<name>_<n>.mp4``, ``conditions/<name>.tum``, and last a record.
+
+    Args:
+        generator: with its adapters.
+        conditions: of the clip.
+        out: folder.
+        name: of the files.
+        samples: how many.
+        seed: with the sample's number it decides every draw.
+        settings: of the sampler.
+        about: further entries of the record ``<name>.json``.
+
+    Raises:
+        ConfigError: conditions that are missing or do not fit.
+        StorageError: no space left.
+    """
+    settings, config = settings or SamplingSettings(), generator.backbone.config
     written = []
     for number in range(samples):
         clip = generator.sample(conditions, seed=seed, number=number, settings=settings)
-        written.append(
-            write_clip(clip, out, f"{name}_{number}", fps=loaded.config.picture.fps, seed=seed, number=number)
-        )
-    record = {
-        "caption": caption, "seed": seed, "samples": samples, "sampling": asdict(settings), "ego": str(ego or ""),
-        "backbone": loaded.config.model_dump(mode="json"), "frames": generator.frame_count,
-    }  # fmt: skip
+        written.append(write_clip(clip, out, f"{name}_{number}", fps=config.picture.fps, seed=seed, number=number))
+    record = sampling_record(generator, conditions.caption, samples=samples, seed=seed, settings=settings)
     with storage_errors(out):
-        (out / f"{name}.json").write_text(json.dumps(record, sort_keys=True, indent=1) + "\n", encoding="utf-8")
+        if conditions.trajectory is not None:
+            (out / "conditions").mkdir(parents=True, exist_ok=True)
+            write_tum(conditions.trajectory, out / "conditions" / f"{name}.tum")
+        text = json.dumps({**record, **(about or {})}, sort_keys=True, indent=1)
+        (out / f"{name}.json").write_text(f"{text}\n", encoding="utf-8")
     return written
+
+
+def sampling_record(
+    generator: ClipGenerator, caption: str, *, samples: int, seed: int, settings: SamplingSettings
+) -> dict[str, Any]:
+    """How a clip's samples are made, in plain values."""
+    return {
+        "caption": caption, "seed": seed, "samples": samples, "sampling": asdict(settings),
+        "backbone": generator.backbone.config.model_dump(mode="json"), "frames": generator.frame_count,
+    }  # fmt: skip
 
 
 def prepare_conditions(
     generator: ClipGenerator, *, image: Path | np.ndarray, caption: str,
     skeleton: Path | np.ndarray | LabelledFrame | None = None,
-    skeleton_video: Path | None = None, ego: str | Path | Trajectory | None = None, objects: Path | None = None,
-    intrinsics: Intrinsics | None = None, extractors: Sequence[str] | None = None, models_dir: Path | None = None,
+    skeleton_video: Path | np.ndarray | None = None, ego: str | Path | Trajectory | None = None,
+    objects: Path | np.ndarray | None = None, intrinsics: Intrinsics | None = None,
+    extractors: Sequence[str] | None = None, models_dir: Path | None = None,
 ) -> ClipConditions:  # fmt: skip
     """What ``generate`` is given, as pictures. See there."""
     pixels = read_image(image) if isinstance(image, Path) else image
@@ -327,8 +207,10 @@ def prepare_conditions(
     return ClipConditions(
         image=pixels, caption=caption, first_control=first,
         ego=None if track is None else ego_clip(track, picture=picture, intrinsics=intrinsics),
-        objects=None if objects is None else object_clip(objects, frames=count, picture=picture),
-        control=None if skeleton_video is None else control_clip(skeleton_video, frames=count, picture=picture),
+        trajectory=track,
+        objects=object_clip(objects, frames=count, picture=picture) if isinstance(objects, Path) else objects,
+        control=control_clip(skeleton_video, frames=count, picture=picture)
+        if isinstance(skeleton_video, Path) else skeleton_video,
     )  # fmt: skip
 
 
