@@ -9,7 +9,7 @@ import json
 import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from labeling.errors import ConfigError
 CHARTS: dict[str, str] = {
     "count": "pipelines.charts_count",
     "ego": "pipelines.charts_ego",
+    "ego-video": "pipelines.charts_ego_video",
 }
 """The module of each chart; it has ``chart(name, *, quick) -> Chart``."""
 
@@ -51,6 +52,8 @@ class ChartPoint:
     settings: dict[str, Any] = field(default_factory=dict)
     ms_per_frame: Cost
     error: Error
+    more_errors: tuple[Error, ...] = ()
+    """By other metrics, the same ones for every point of a chart; each is drawn below the first."""
     reference: bool = False
     """The best that can be run at all, or the trivial method: drawn apart."""
 
@@ -123,44 +126,55 @@ def write_chart(chart: Chart, out: Path) -> None:
 
 
 def draw_chart(chart: Chart, path: Path) -> None:
-    """The picture: cost on a log axis, error upwards, the front as a line, every point named."""
+    """The picture: cost on a log axis, error upwards, the front as a line, every point named; a panel a metric."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 6.4), dpi=120, layout="constrained")
-    axes = figure.add_subplot()
-    front = pareto_front(chart.points)
+    errors = zip(*((point.error, *point.more_errors) for point in chart.points), strict=True)
+    panels = [
+        [replace(point, error=error, more_errors=()) for point, error in zip(chart.points, row, strict=True)]
+        for row in errors
+    ]
+    height = 6.4 if len(panels) == 1 else 5.2 * len(panels)
+    figure = Figure(figsize=(10, height), dpi=120, layout="constrained")
+    every_axes = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
+    for axes, points in zip(every_axes, panels, strict=True):
+        _draw_panel(axes, points)
+    every_axes[0].set_title(f"{chart.stage}: {chart.data}\n", fontsize=11, loc="left", wrap=True)
+    every_axes[0].text(
+        0, 1.012, f"{chart.machine}; {chart.threads} thread{'s' if chart.threads > 1 else ''}; diamonds: references; "
+        "line: Pareto front", transform=every_axes[0].transAxes, fontsize=8, color="#4a5568",
+    )  # fmt: skip
+    every_axes[-1].set_xlabel("cost, ms per frame (median, log)")
+    figure.canvas.draw()
+    for axes, points in zip(every_axes, panels, strict=True):
+        _name_points(axes, points)
+    figure.savefig(path)
+
+
+def _draw_panel(axes: Any, points: Sequence[ChartPoint]) -> None:
+    front = pareto_front(points)
     axes.step(
         [point.ms_per_frame.median for point in front], [point.error.median for point in front], where="post",
         color="#2b6cb0", alpha=0.5, linewidth=1.5, zorder=1,
     )  # fmt: skip
-    for point in chart.points:
+    for point in points:
         colour = "#c05621" if point.reference else "#2b6cb0" if point in front else "#718096"
         axes.scatter(
             point.ms_per_frame.median, point.error.median, s=46, color=colour, zorder=3,
             marker="D" if point.reference else "o",
         )  # fmt: skip
     axes.set_xscale("log")
-    errors = [point.error.median for point in chart.points if point.error.median > 0]
-    if len(errors) > 1 and max(errors) > 30 * min(errors) and len(errors) == len(chart.points):
+    errors = [point.error.median for point in points if point.error.median > 0]
+    if len(errors) > 1 and max(errors) > 30 * min(errors) and len(errors) == len(points):
         axes.set_yscale("log")
     axes.margins(x=0.18, y=0.12)
-    _name_points(axes, chart.points)
-    unit = chart.points[0].error
-    axes.set_xlabel("cost, ms per frame (median, log)")
-    axes.set_ylabel(f"{unit.metric}, {unit.unit} (median)")
-    axes.set_title(f"{chart.stage}: {chart.data}\n", fontsize=11, loc="left")
-    axes.text(
-        0, 1.012, f"{chart.machine}; {chart.threads} thread{'s' if chart.threads > 1 else ''}; diamonds: references; "
-        "line: Pareto front", transform=axes.transAxes, fontsize=8, color="#4a5568",
-    )  # fmt: skip
+    axes.set_ylabel(f"{points[0].error.metric}, {points[0].error.unit} (median)")
     axes.grid(True, which="both", alpha=0.2)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path)
 
 
 def _name_points(axes: Any, points: Sequence[ChartPoint]) -> None:
     """Names beside the points, moved up or down until they are clear of each other."""
-    axes.figure.canvas.draw()
     taken: list[tuple[float, float, float]] = []
     for point in sorted(points, key=lambda point: -point.error.median):
         x, y = axes.transData.transform((point.ms_per_frame.median, point.error.median))

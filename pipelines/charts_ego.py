@@ -17,39 +17,52 @@ _REFERENCES = ("constant zero", "ladder + windowed refinement")
 
 
 def chart(name: str, *, quick: bool = False) -> Chart:
-    """Mean displacement error over 5 s with one fitted scale; rotation, direction and the rest stand in the settings.
+    """Mean displacement error over 5 s with one fitted scale, then rotation and direction, a step at a time.
 
-    Truth is KITTI 03 (10 fps; GPS and IMU) where it is there, and street drives (exact). Every point's error is the
-    median over the windows of all clips.
+    Truth is KITTI 03 (10 fps; GPS and IMU) where it is there, and street drives (exact). Every point's error is over
+    all windows, or all steps, of all clips; each clip's own figures stand in the settings.
     """
     clips = _clips(quick)
     runs = 1 if quick else 3
-    points = []
     found: dict[str, list[np.ndarray]] = {}
     timed: list[Callable[[], int]] = []
     for method, (estimate, clip_of) in _METHODS.items():
         found[method] = [estimate(clip_of(clip)) for clip in clips]
         timed.append(partial(_once, estimate, [clip_of(clip) for clip in clips[:1]]))
     costs = interleaved_ms(timed, runs=runs)
+    points = []
     for (method, poses), cost in zip(found.items(), costs, strict=True):
-        windows = np.concatenate([
-            window_errors_m(mine, clip.truth, frames=_window(clip), fit_scale=True)
-            for mine, clip in zip(poses, clips, strict=True)
-        ])  # fmt: skip
+        displacement, *others = _errors(poses, clips)
         points.append(
             ChartPoint(
-                method=method, settings=_figures(poses, clips), ms_per_frame=cost,
-                error=Error(
-                    metric="displacement over 5 s, one fitted scale", unit="m", median=_round(np.median(windows)),
-                    p95=_round(np.percentile(windows, 95)),
-                ),
-                reference=method in _REFERENCES,
+                method=method, settings=_figures(poses, clips), ms_per_frame=cost, error=displacement,
+                more_errors=tuple(others), reference=method in _REFERENCES,
             )
         )  # fmt: skip
-    data = "; ".join(
-        f"{clip.name} {clip.frames[0].shape[1]}x{clip.frames[0].shape[0]}, {len(clip.frames)} frames" for clip in clips
-    )
-    return Chart(stage=name, data=f"{data}; cost on the first", points=tuple(points), machine=machine_name())
+    data = ", ".join(f"{clip.name} ({len(clip.frames)})" for clip in clips)
+    data += f" frames; cost on the first, {clips[0].frames[0].shape[1]}x{clips[0].frames[0].shape[0]}"
+    return Chart(stage=name, data=data, points=tuple(points), machine=machine_name())
+
+
+def _errors(poses: list[np.ndarray], clips: list[EgoClip]) -> list[Error]:
+    """Displacement, rotation and direction over all clips."""
+    pairs = [(mine, clip.truth) for mine, clip in zip(poses, clips, strict=True)]
+    windows = [
+        window_errors_m(mine, clip.truth, frames=_window(clip), fit_scale=True)
+        for mine, clip in zip(poses, clips, strict=True)
+    ]
+    turns = [rotation_errors_deg(*pair) for pair in pairs]
+    directions = [direction_errors_deg(*pair, least_m=0.1, ground_plane=True) for pair in pairs]
+    return [
+        _error("displacement in 5 s, one fitted scale", "m", windows),
+        _error("rotation a frame", "degrees", turns),
+        _error("direction in the ground plane", "degrees", directions),
+    ]
+
+
+def _error(metric: str, unit: str, parts: list[np.ndarray]) -> Error:
+    every = np.concatenate(parts)
+    return Error(metric=metric, unit=unit, median=_round(np.median(every)), p95=_round(np.percentile(every, 95)))
 
 
 def _clips(quick: bool) -> list[EgoClip]:
