@@ -60,6 +60,15 @@ def generate(
     caption: Annotated[str | None, typer.Option(help="What the clip shows.")] = None,
     data: Annotated[Path | None, typer.Option(help="A job: start from one of its clips instead.")] = None,
     clip: Annotated[str | None, typer.Option(help="Which clip of the job; by default the first.")] = None,
+    clips: Annotated[
+        str | None, typer.Option(help="Many clips of the job: val, train, all, or keys with commas.")
+    ] = None,
+    true_skeletons: Annotated[
+        bool, typer.Option("--true-skeletons", help="With --clips: paint over the clips' own skeletons.")
+    ] = False,
+    object_variant: Annotated[
+        int | None, typer.Option(help="With --clips: condition on this object video of each clip too.")
+    ] = None,
     skeleton: Annotated[Path | None, typer.Option(help="The first skeleton; by default extracted.")] = None,
     skeleton_video: Annotated[Path | None, typer.Option(help="All skeletons, instead of the motion stage.")] = None,
     ego: Annotated[str | None, typer.Option(help="Trajectory file, or words such as 'straight 10m/s'.")] = None,
@@ -85,6 +94,18 @@ def generate(
         guidance=guidance, coordinates=coordinates, frames=frames,
         extractors=tuple(extractors.split(",")) if extractors else None, models_dir=models, device=device,
     )  # fmt: skip
+    if clips is not None or true_skeletons or object_variant is not None:
+        from pipelines.generate_clips import ClipsRequest, show_clips
+
+        request = ClipsRequest(
+            clips=clips or clip or "val",
+            ego=ego,
+            caption=caption,
+            true_skeletons=true_skeletons,
+            object_variant=object_variant,
+        )
+        show_clips(data, request, out=out, motion=motion, appearance=appearance, end_to_end=end_to_end, options=options)
+        return
     run_generate(
         out=out, motion=motion, appearance=appearance, end_to_end=end_to_end, image=image, caption=caption,
         skeleton=skeleton, ego=ego, data=data, clip=clip, options=options,

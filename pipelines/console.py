@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from dataset.receipts import Receipt, reason_counts
@@ -78,6 +78,15 @@ def left_out_words(receipts: Sequence[Receipt]) -> list[str]:
     for receipt in receipts:
         total.update(receipt.facts.get("left_out", {}))
     return [f"[yellow]{card} saw {count} more than its card allows in a frame[/]" for card, count in total.items()]
+
+
+def counting_bar() -> Progress:
+    """A bar that counts items; nothing where no person looks."""
+    console = make_console()
+    return Progress(
+        TextColumn("{task.description:>10}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn(),
+        console=console, transient=True, disable=not console.is_terminal,
+    )  # fmt: skip
 
 
 def print_error(error: Exception) -> None:

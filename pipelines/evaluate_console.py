@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from pipelines.console import make_console
+from pipelines.console import counting_bar, make_console
 from pipelines.evaluate import EvaluateOptions, evaluate
 from training.evaluation_report import FIGURES, SAMPLES, TRUE_SKELETONS, Figure, Report, SetSummary
 from training.metrics import Interval
@@ -25,10 +24,7 @@ def show_evaluation(job: Path, samples: Path, options: EvaluateOptions) -> int:
         AnimaticError: as ``evaluate``.
     """
     console = make_console()
-    with Progress(
-        TextColumn("{task.description:>10}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=console, transient=True, disable=not console.is_terminal,
-    ) as progress:  # fmt: skip
+    with counting_bar() as progress:
         task = progress.add_task("evaluate", total=None)
         found = evaluate(
             job, samples, options, on_clip=lambda done, total: progress.update(task, completed=done, total=total)
@@ -50,7 +46,7 @@ def described(report: Report) -> str:
 
 
 def figure_table(report: Report, *, title: str = "") -> Table:
-    """Figures down, sets across: means, 95 % intervals over source videos for what is judged, clips if not all count."""
+    """Figures down, sets across: means, intervals (95 %, over source videos) of what is judged, clips if not all."""
     shown = [name for name, summary in report.sets.items() if summary.samples]
     attributed = TRUE_SKELETONS in shown
     table = Table(title=escape(title), title_justify="left", box=None, pad_edge=False)

@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from dataset.inspection import find_sample
 from dataset.loader import Sample
 from labeling.camera import Intrinsics, rebased_trajectory
 from labeling.errors import ConfigError
-from pipelines.console import file_size, make_console
+from pipelines.console import counting_bar, file_size, make_console
 from pipelines.stage import parse_part
 from training.config import STAGES, Stage, load_config
 from training.dry_run import RunPlan
@@ -51,7 +50,7 @@ def run_cache(
         AnimaticError: as ``cache_latents``.
     """
     share = parse_part(part) if part else None
-    with _bar() as progress:
+    with counting_bar() as progress:
         task = progress.add_task("cache", total=None)
 
         def show(done: int, total: int) -> None:
@@ -155,11 +154,3 @@ def clip_conditions(sample: Sample, *, with_ego: bool = True) -> dict[str, Any]:
         poses = sample.cam_to_world
         conditions["ego"] = rebased_trajectory(np.arange(len(poses)) / meta["fps"], poses)
     return conditions
-
-
-def _bar() -> Progress:
-    console = make_console()
-    return Progress(
-        TextColumn("{task.description:>10}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=console, transient=True, disable=not console.is_terminal,
-    )  # fmt: skip
