@@ -21,13 +21,16 @@ _PLANE_M = 15.0
 _FARTHEST_PIXEL = 16_000
 
 
-def released_frames(trajectory: Trajectory, *, width: int, height: int) -> Iterator[np.ndarray]:
+def released_frames(
+    trajectory: Trajectory, *, width: int, height: int, step: int | None = None
+) -> Iterator[np.ndarray]:
     """Frames of the released look: T - 1 are rendered, the last is shown twice.
 
     Args:
         trajectory: T poses; a single one counts as standing still.
         width: of the picture, pixels.
         height: of the picture, pixels.
+        step: as in ``draw_sphere``.
 
     Yields:
         (height, width, 3) uint8, RGB, T of them.
@@ -43,7 +46,7 @@ def released_frames(trajectory: Trajectory, *, width: int, height: int) -> Itera
     lines = _SpeedLines(width, height, lens)
     picture = np.zeros((height, width, 3), np.uint8)
     for now, following in zip(poses[:-1], poses[1:], strict=True):
-        picture = draw_sphere(now, raster=raster, lens=lens, width=width, height=height)
+        picture = draw_sphere(now, raster=raster, lens=lens, width=width, height=height, step=step)
         lines.draw_and_move(picture, invert(following) @ now)
         yield picture
     if len(trajectory) > 1:

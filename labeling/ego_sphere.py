@@ -77,7 +77,9 @@ def world_raster(intrinsics: Intrinsics) -> CheckRaster:
     )  # fmt: skip
 
 
-def draw_sphere(cam_to_world: np.ndarray, *, raster: CheckRaster, lens: Lens, width: int, height: int) -> np.ndarray:
+def draw_sphere(
+    cam_to_world: np.ndarray, *, raster: CheckRaster, lens: Lens, width: int, height: int, step: int | None = None
+) -> np.ndarray:
     """The sphere as a camera inside it sees it, sampled bilinearly from the raster.
 
     Args:
@@ -86,6 +88,7 @@ def draw_sphere(cam_to_world: np.ndarray, *, raster: CheckRaster, lens: Lens, wi
         lens: the camera's.
         width: of the picture, pixels.
         height: of the picture, pixels.
+        step: pixels between exact coordinates, 1 for every pixel; by default ``grid_step``.
 
     Returns:
         (height, width, 3) uint8, RGB.
@@ -103,9 +106,14 @@ def draw_sphere(cam_to_world: np.ndarray, *, raster: CheckRaster, lens: Lens, wi
     view = np.array([lens.fx, lens.fy, lens.cx, lens.cy])
     size = np.array([len(raster.columns) - 2, len(raster.rows) - 2], np.float64)
     motion = np.ascontiguousarray(cam_to_world, dtype=np.float64)
-    step = int(min(max(2, min(lens.fx, lens.fy) // _FOCAL_PER_STEP), _LARGEST_STEP))
+    step = step or grid_step(lens)
     _draw_blocks(picture, step, motion, view, size, raster.columns, raster.rows, raster.palette, raster.rounding)
     return picture
+
+
+def grid_step(lens: Lens) -> int:
+    """Pixels between exact coordinates where linear interpolation between them is good enough."""
+    return int(min(max(2, min(lens.fx, lens.fy) // _FOCAL_PER_STEP), _LARGEST_STEP))
 
 
 def sphere_coordinates(cam_to_world: np.ndarray, x: np.ndarray, y: np.ndarray, *, lens: Lens) -> np.ndarray:

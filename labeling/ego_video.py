@@ -59,13 +59,30 @@ def ego_frames(
         if missing is None:
             return ego_reference.reference_frames(trajectory, intrinsics=camera, seed=seed)
         warnings.warn(missing, RuntimeWarning, stacklevel=2)
-    return _world_frames(trajectory, camera, seed)
+    return world_frames(trajectory, intrinsics=camera, seed=seed)
 
 
-def _world_frames(trajectory: Trajectory, camera: Intrinsics, seed: int) -> Iterator[np.ndarray]:
-    raster, cube = world_raster(camera), fill_cube(camera, seed=seed)
-    lens = Lens(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
+def world_frames(
+    trajectory: Trajectory, *, intrinsics: Intrinsics, seed: int = 0, step: int | None = None
+) -> Iterator[np.ndarray]:
+    """The frames of style ``world`` by the default renderer.
+
+    Args:
+        trajectory: a clip's.
+        intrinsics: of the picture to draw, which has its size.
+        seed: of the dust.
+        step: as in ``draw_sphere``.
+
+    Yields:
+        (height, width, 3) uint8, RGB.
+
+    Raises:
+        TrajectoryError: the camera drives out of the sphere.
+    """
+    raster, cube = world_raster(intrinsics), fill_cube(intrinsics, seed=seed)
+    lens = Lens(fx=intrinsics.fx, fy=intrinsics.fy, cx=intrinsics.cx, cy=intrinsics.cy)
+    width, height = intrinsics.width, intrinsics.height
     for motion in trajectory.cam_to_world:
-        picture = draw_sphere(motion, raster=raster, lens=lens, width=camera.width, height=camera.height)
-        draw_specks(picture, specks_in_view(cube, motion, intrinsics=camera))
+        picture = draw_sphere(motion, raster=raster, lens=lens, width=width, height=height, step=step)
+        draw_specks(picture, specks_in_view(cube, motion, intrinsics=intrinsics))
         yield picture

@@ -15,53 +15,25 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parents[1]), str(HERE.parent)]
 
-from labeling.camera import prior_intrinsics, rebased_trajectory, rigid  # noqa: E402
+from labeling.camera import prior_intrinsics  # noqa: E402
 from labeling.ego_dust import draw_specks, fill_cube, specks_in_view  # noqa: E402
 from labeling.ego_reference import missing_library  # noqa: E402
 from labeling.ego_sphere import Lens, draw_sphere, world_raster  # noqa: E402
 from labeling.ego_video import ego_frames  # noqa: E402
+from pipelines.charts_ego_video import HEIGHT, WIDTH, looked_up, turning_drive  # noqa: E402
 
-WIDTH, HEIGHT = 1056, 704
 TARGET_MS = 7.0
 ROUNDS = 40
-
-
-def drive(frames: int = 200):
-    """13 m/s with a turn of 60 degrees in all."""
-    share = np.linspace(0, 1, frames)
-    rotation = Rotation.from_euler("y", (60 * share)[:, None], degrees=True).as_matrix()
-    return rebased_trajectory(np.arange(frames) / 24, rigid(rotation, np.outer(share, [10, 0, 13 * frames / 24])))
-
-
-def looked_up(motion: np.ndarray, texture: np.ndarray, *, step: int) -> np.ndarray:
-    """The sphere from numpy coordinates on every ``step``-th pixel and one ``cv2.remap``; seams are not mended."""
-    camera = prior_intrinsics(WIDTH, HEIGHT)
-    # Resizing puts a node in the middle of its step.
-    x = np.arange(WIDTH // step) * step + (step - 1) / 2
-    y = np.arange(HEIGHT // step) * step + (step - 1) / 2
-    rays = np.stack(np.broadcast_arrays((x - camera.cx) / camera.fx, ((y - camera.cy) / camera.fy)[:, None], 1.0), -1)
-    rays = rays @ motion[:3, :3].T
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    position = motion[:3, 3]
-    along = rays @ position
-    points = position + rays * (np.sqrt(along**2 + 500.0**2 - position @ position) - along)[..., None]
-    height, width = texture.shape[:2]
-    u = (np.arctan2(-points[..., 2], points[..., 0]) / (2 * np.pi) + 0.5) * width - 0.5
-    v = np.arccos(points[..., 1] / 500) / np.pi * height - 0.5
-    if step > 1:
-        u, v = (cv2.resize(one.astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR) for one in (u, v))
-    return cv2.remap(texture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
 
 
 def main() -> None:
     """Measure, print and write."""
     cv2.setNumThreads(1)
-    trajectory, camera = drive(), prior_intrinsics(WIDTH, HEIGHT)
+    trajectory, camera = turning_drive(), prior_intrinsics(WIDTH, HEIGHT)
     raster, cube, texture = world_raster(camera), fill_cube(camera, seed=0), world_raster(camera).picture()
     lens = Lens(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
     size: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
@@ -77,8 +49,8 @@ def main() -> None:
     methods["world: sphere alone"] = lambda motion: draw_sphere(motion, raster=raster, lens=lens, **size)
     dusty = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     methods["world: dust alone"] = lambda motion: draw_specks(dusty, specks_in_view(cube, motion, intrinsics=camera))
-    methods["sphere, every 8th pixel, cv2.remap"] = lambda motion: looked_up(motion, texture, step=8)
-    methods["sphere, every pixel, numpy"] = lambda motion: looked_up(motion, texture, step=1)
+    methods["sphere, every 8th pixel, cv2.remap"] = lambda motion: looked_up(motion, texture, camera, step=8)
+    methods["sphere, every pixel, numpy"] = lambda motion: looked_up(motion, texture, camera, step=1)
     times: dict[str, list[float]] = {name: [] for name in methods}
     for motion in trajectory.cam_to_world[: ROUNDS + 2]:
         for name, method in methods.items():
