@@ -27,10 +27,10 @@ from training.street_targets import grid_cells
 ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_lane24", "street_car24_fields"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
 STEPS: dict[ModelName, int] = {
-    "street_detector": 4000, "street_car24": 1300, "street_coco17": 2400, "street_lane24": 1400,
+    "street_detector": 5000, "street_car24": 1300, "street_coco17": 2400, "street_lane24": 1400,
     "street_car24_fields": 800,
 }  # fmt: skip
-_WINDOW = (416, 288)
+_WINDOW = (576, 384)
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
 _HIDDEN_WEIGHTS = {"car24": 1.0, "coco17": 2.0}
 """A walker's far arm and leg come and go: in doubt they are called hidden."""
@@ -86,7 +86,7 @@ def _detector_recipe(settings: FitSettings) -> Recipe:
     )  # fmt: skip
     return Recipe(
         card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph, loss=loss, fit=settings,
-        batches=lambda pool: DetectorBatches(pool=pool, size=_WINDOW, count=12, augment=AugmentSettings()),
+        batches=lambda pool: DetectorBatches(pool=pool, size=_WINDOW, count=6, augment=AugmentSettings()),
     )  # fmt: skip
 
 
