@@ -5,7 +5,7 @@ so that small and fast ones still meet their predictions (Yang et al. 2023, C-BI
 camera's own turn taken out of the prediction where it is known. Lanes are compared as lines.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,6 +70,7 @@ class BoxTracker:
         *,
         frame_step: int = 1,
         previous_to_current: np.ndarray | None = None,
+        carried: Mapping[int, np.ndarray] | None = None,
     ) -> np.ndarray:
         """Ids for the boxes of the next frame.
 
@@ -78,6 +79,7 @@ class BoxTracker:
             scores: (N,) 0 to 1.
             frame_step: frames since the last call.
             previous_to_current: (3, 3) homography that the camera's turn since the last call makes of far points.
+            carried: where flow took the boxes of some tracks, (4,) by id.
 
         Returns:
             (N,) int ids; ``UNTRACKED`` for boxes too unsure to start a track.
@@ -87,6 +89,8 @@ class BoxTracker:
             _predict(track, frame_step)
             if previous_to_current is not None:
                 _move_with_camera(track, previous_to_current)
+            if carried and track.track_id in carried:
+                _correct(track, carried[track.track_id])
         ids = np.full(len(boxes), UNTRACKED)
         high = np.flatnonzero(scores >= self.settings.high_score)
         low = np.flatnonzero(scores < self.settings.high_score)
@@ -117,6 +121,7 @@ class BoxTracker:
             if allowed[row, column]:
                 taken[column] = True
                 _correct(tracks[row], boxes[chosen[column]])
+                tracks[row].lost_frames = 0
                 ids[chosen[column]] = tracks[row].track_id
         return chosen[~taken]
 
@@ -145,7 +150,12 @@ class RunTracker:
         self._trackers, self._frame = {}, None
 
     def update(
-        self, labels: Sequence[Keypoints], *, frame: int, previous_to_current: np.ndarray | None = None
+        self,
+        labels: Sequence[Keypoints],
+        *,
+        frame: int,
+        previous_to_current: np.ndarray | None = None,
+        carried: Mapping[int, np.ndarray] | None = None,
     ) -> list[Keypoints]:
         """One frame's labels with ids; those that belong to no track are left out.
 
@@ -153,6 +163,7 @@ class RunTracker:
             labels: everything seen in the frame.
             frame: its grid number, later than the last call's.
             previous_to_current: as ``BoxTracker.update`` takes it.
+            carried: as ``BoxTracker.update`` takes it.
         """
         step = frame - self._frame if self._frame is not None else 1
         self._frame = frame
@@ -164,7 +175,7 @@ class RunTracker:
             )
             self._trackers[category] = tracker
             tracker.next_id = self._next_id
-            ids = _update(tracker, group, step, previous_to_current)
+            ids = _update(tracker, group, step, previous_to_current, carried)
             self._next_id = tracker.next_id
             out += [replace(label, track_id=int(i)) for label, i in zip(group, ids, strict=True) if i != UNTRACKED]
         return out
@@ -281,13 +292,17 @@ def iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
 
 
 def _update(
-    tracker: BoxTracker | LaneTracker, group: list[Keypoints], step: int, turn: np.ndarray | None
+    tracker: BoxTracker | LaneTracker,
+    group: list[Keypoints],
+    step: int,
+    turn: np.ndarray | None,
+    carried: Mapping[int, np.ndarray] | None,
 ) -> np.ndarray:
     if isinstance(tracker, LaneTracker):
         return tracker.update([label.points for label in group], frame_step=step, previous_to_current=turn)
     boxes = np.array([label.box_xyxy for label in group], np.float64).reshape(-1, 4)
     scores = np.array([label.score for label in group])
-    return tracker.update(boxes, scores, frame_step=step, previous_to_current=turn)
+    return tracker.update(boxes, scores, frame_step=step, previous_to_current=turn, carried=carried)
 
 
 def _grown(boxes_xyxy: np.ndarray, buffer: float) -> np.ndarray:
@@ -328,7 +343,6 @@ def _correct(track: _Track, box_xyxy: np.ndarray) -> None:
     gain = track.covariance[:, :, 0] / (track.covariance[:, 0, 0] + sigma**2)[:, None]
     track.mean = track.mean + gain * innovation[:, None]
     track.covariance = track.covariance - gain[:, :, None] * track.covariance[:, :1, :]
-    track.lost_frames = 0
 
 
 def _turned(line: np.ndarray, previous_to_current: np.ndarray) -> np.ndarray:

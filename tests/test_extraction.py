@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from labeling.carrying import carry, close_gap, interpolate_gap, small_grey
+from labeling.efforts import EFFORTS, Effort, straight_gap
 from labeling.errors import ConfigError, ModelError
-from labeling.extraction import EFFORTS, Effort, label_with, straight_gap
+from labeling.extraction import label_with
 from labeling.extractors import choose_extractors
 from labeling.labels import POINT_CARRIED, POINT_DETECTED, POINT_INTERPOLATED, Keypoints
 

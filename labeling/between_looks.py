@@ -1,0 +1,153 @@
+"""What is shown between two looks: objects carried from the first, corrected by the second.
+
+What the second look no longer sees is carried on for a while, and what it sees anew is carried back for as long: half a
+gap each, on average where it truly went or came from.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from labeling.carrying import UNSEEN_FRAMES, along_path, box_diagonal, carry, close_gap, interpolate_gap
+from labeling.labels import Keypoints
+
+_BORDER_PX = 4.0
+"""What is nearer to the picture's border is expected to leave it."""
+_LEAST_INSIDE = 0.4
+"""Share of a carried box that must lie in the picture for the object to be shown."""
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class BetweenLooks:
+    """The last look, and where its objects have been carried since."""
+
+    flow_step: int
+    """Frames between two steps of flow; 0 for none."""
+    shown_frames: int
+    """How long something is shown that the next look, or the one before, does not know."""
+    seen: list[Keypoints] = field(default_factory=list)
+    """What the last look saw."""
+    frame: int | None = None
+    """When it looked."""
+    _paths: dict[int, list[Keypoints]] = field(default_factory=dict)
+    _trail: list[tuple[np.ndarray, int]] = field(default_factory=list)
+    _followed: set[int] = field(default_factory=set)
+    _slippery: set[int] = field(default_factory=set)
+
+    def start(self, seen: list[Keypoints], *, frame: int, grey: np.ndarray | None) -> None:
+        """A look was taken; ``grey`` (``small_grey`` of its frame) where flow is to carry what it saw."""
+        self.seen, self.frame = seen, frame
+        self._paths = {label.track_id: [label] for label in seen}
+        self._trail = [] if grey is None else [(grey, frame)]
+        self._followed = set(self._paths)
+
+    def due(self, frame: int) -> bool:
+        """Whether flow takes a step at ``frame``."""
+        return bool(self._trail) and frame - self._trail[-1][1] >= self.flow_step
+
+    def arriving(self, frame: int) -> bool:
+        """Whether flow has a way to go to ``frame``, where the next look is taken; to the next frame it has none."""
+        return bool(self._trail) and self._trail[-1][1] < frame and frame - self._trail[0][1] > 1
+
+    def carry(self, grey: np.ndarray, *, frame: int) -> bool:
+        """Carry all objects on; False when one inside the picture was lost for the first time."""
+        carried = carry(self._trail[-1][0], grey, [path[-1] for path in self._paths.values()], frame=frame)
+        self._trail.append((grey, frame))
+        for path, moved in zip(self._paths.values(), carried, strict=True):
+            path.append(moved.label)
+        lost = {
+            moved.label.track_id for moved in carried
+            if not moved.followed and not _at_border(moved.label.box_xyxy, self._size)
+        }  # fmt: skip
+        self._followed -= {moved.label.track_id for moved in carried if not moved.followed}
+        # Flow that loses what the next look finds again has nothing to hold on to there: it asks for no second look.
+        new = lost - self._slippery
+        self._slippery |= lost
+        return not new
+
+    def carried(self, frame: int) -> dict[int, np.ndarray]:
+        """(4,) boxes by track id, of objects that flow followed all the way to ``frame``."""
+        latest = {track_id: path[-1] for track_id, path in self._paths.items() if track_id in self._followed}
+        return {i: label.box_xyxy for i, label in latest.items() if len(self._paths[i]) > 1 and label.frame == frame}
+
+    def close(self, seen: Sequence[Keypoints], *, frame: int) -> tuple[list[Keypoints], float]:
+        """The labels between the last look and the one just taken.
+
+        Args:
+            seen: what the new look saw, tracked.
+            frame: when.
+
+        Returns:
+            The labels of the frames between, and the median distance by which carried points missed the new look, in
+            box diagonals; 0 where nothing was carried.
+        """
+        now = {label.track_id: label for label in seen}
+        labels: list[Keypoints] = []
+        misses = []
+        for label in self.seen:
+            path, end = self._paths[label.track_id], now.get(label.track_id)
+            if end is None:
+                labels += [step for step in along_path(path) if step.frame < min(frame, label.frame + self._shown + 1)]
+            elif len(path) > 1 and path[-1].frame == frame:
+                misses.append(_miss(path[-1], end))
+                labels += close_gap(path, end)
+            else:
+                labels += interpolate_gap(label, end)
+        known = {label.track_id for label in self.seen}
+        labels += self._came_from([label for label in seen if label.track_id not in known], frame)
+        return self._inside(labels), float(np.median(misses)) if misses else 0.0
+
+    @property
+    def _shown(self) -> int:
+        return min(self.shown_frames, UNSEEN_FRAMES)
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        """Width and height of full frames."""
+        height, width = self._trail[0][0].shape
+        return 2 * width, 2 * height
+
+    def _came_from(self, new: list[Keypoints], frame: int) -> list[Keypoints]:
+        """New objects carried back towards the look that did not see them."""
+        if not new or not self._trail or self._trail[-1][1] != frame:
+            return []
+        paths = [[label] for label in new]
+        alive = list(paths)
+        for (earlier, number), (later, _) in zip(self._trail[-2:0:-1], self._trail[:1:-1], strict=True):
+            if number < frame - self._shown or not alive:
+                break
+            carried = carry(later, earlier, [path[0] for path in alive], frame=number)
+            for path, moved in zip(alive, carried, strict=True):
+                if moved.followed:
+                    path.insert(0, moved.label)
+            alive = [path for path in alive if path[0].frame == number]
+        return [label for path in paths for label in (path[0], *along_path(path)) if label.frame < frame]
+
+    def _inside(self, labels: list[Keypoints]) -> list[Keypoints]:
+        """Labels with their boxes cut at the picture's border; what flow took out of the picture is left out."""
+        if not self._trail:
+            return labels
+        limits = np.array([*self._size, *self._size], np.float32)
+        kept = []
+        for label in labels:
+            box = np.clip(label.box_xyxy, 0, limits)
+            if _area(box) >= _LEAST_INSIDE * _area(label.box_xyxy):
+                kept.append(label if (box == label.box_xyxy).all() else replace(label, box_xyxy=box))
+        return kept
+
+
+def _area(box_xyxy: np.ndarray) -> float:
+    return float(max(box_xyxy[2] - box_xyxy[0], 0) * max(box_xyxy[3] - box_xyxy[1], 0))
+
+
+def _at_border(box_xyxy: np.ndarray, size: tuple[int, int]) -> bool:
+    return bool((box_xyxy[:2] <= _BORDER_PX).any() or (box_xyxy[2:] >= np.subtract(size, _BORDER_PX)).any())
+
+
+def _miss(carried: Keypoints, seen: Keypoints) -> float:
+    both = carried.present & seen.present
+    if not both.any():
+        return 0.0
+    distance = np.linalg.norm(carried.points[both, :2] - seen.points[both, :2], axis=1)
+    return float(np.median(distance)) / box_diagonal(seen.box_xyxy)

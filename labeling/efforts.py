@@ -1,0 +1,108 @@
+"""How often the networks look: the efforts, and the rhythm that follows what was seen.
+
+Looks come closer together when objects appear, vanish, or are not where flow put them; a network that has seen nothing
+for a second looks twice per second.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from labeling.carrying import box_diagonal
+from labeling.labels import Keypoints
+
+Effort = Literal["fast", "balanced", "exact"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EffortSettings:
+    """How often the networks look. Gaps are in frames of the 24 fps grid; 1 is every frame."""
+
+    max_gap: int
+    """Longest time between two looks: half a second at most, so that nothing is shown that was not seen 0.25 s away."""
+    max_person_gap: int
+    """The same while someone walks: legs swing at about 1 Hz and do not go straight."""
+    max_lane_gap: int
+    """The same for lane lines, which have no points to follow."""
+    flow_step: int = 1
+    """Frames between two steps of the optical flow that carries points; 0 for none: points go straight then."""
+    max_bend: float = 0.03
+    """Share of its size by which an object's growth may depart from a straight line where no flow follows it."""
+    max_miss: float = 0.03
+    """Share of the box diagonal by which carried points may miss the next look before looks come closer together."""
+    quiet_frames: int = 24
+    """A network that has seen nothing for so long looks only every ``quiet_gap`` frames."""
+    quiet_gap: int = 12
+
+
+EFFORTS: dict[Effort, EffortSettings] = {
+    "exact": EffortSettings(max_gap=1, max_person_gap=1, max_lane_gap=1, flow_step=0, quiet_gap=1),
+    "balanced": EffortSettings(max_gap=8, max_person_gap=5, max_lane_gap=12, flow_step=2),
+    "fast": EffortSettings(max_gap=12, max_person_gap=12, max_lane_gap=12, flow_step=3, max_bend=0.05, max_miss=0.05),
+}
+
+_WAITING_GAP = 6
+"""While nothing has been seen for a moment only."""
+_NEAR_PX = 48.0
+"""Objects at least this high bring looks closer together when they come or go; what is far may be seen later."""
+
+
+class Rhythm:
+    """When to look again.
+
+    Args:
+        settings: the effort.
+        flows: whether flow carries what this look sees.
+    """
+
+    def __init__(self, settings: EffortSettings, *, flows: bool) -> None:
+        self.settings, self.flows = settings, flows
+        self.gap = max(1, settings.max_gap // 2)
+        """Frames from the last look to the next."""
+        self._last_seen: int | None = None
+
+    def after(self, seen: Sequence[Keypoints], before: Sequence[Keypoints], *, miss: float, frame: int) -> None:
+        """Choose the next gap.
+
+        Args:
+            seen: what the look at ``frame`` saw, tracked.
+            before: what the look before it saw; nothing at the first.
+            miss: how far carried points missed this look, in box diagonals.
+            frame: grid number.
+        """
+        first = self._last_seen is None
+        if seen or first:
+            self._last_seen = frame
+        self.gap = max(1, int(self._next(seen, [] if first else before, miss, frame)))
+
+    def _next(self, seen: Sequence[Keypoints], before: Sequence[Keypoints], miss: float, frame: int) -> float:
+        settings = self.settings
+        if not seen:
+            quiet = frame - (self._last_seen or 0) >= settings.quiet_frames
+            return settings.quiet_gap if quiet else min(settings.max_gap, _WAITING_GAP)
+        gap = float(self.gap + 2 if miss <= settings.max_miss else self.gap // 2)
+        old, new = ({label.track_id: label for label in labels} for labels in (before, seen))
+        if any(_height(new.get(i) or old[i]) >= _NEAR_PX for i in set(old) ^ set(new)):
+            gap = min(gap, settings.max_gap / 2)
+        return min(gap, *(self._longest(label, old.get(label.track_id)) for label in seen))
+
+    def _longest(self, label: Keypoints, before: Keypoints | None) -> float:
+        """How long one object may go without a look."""
+        if label.category == "lane":
+            return self.settings.max_lane_gap
+        longest = self.settings.max_person_gap if label.category == "person" else self.settings.max_gap
+        if self.flows or before is None:
+            return longest
+        return min(longest, straight_gap(before, label, max_bend=self.settings.max_bend))
+
+
+def straight_gap(before: Keypoints, after: Keypoints, *, max_bend: float) -> float:
+    """How many frames an object may be taken to grow evenly: size is 1 / distance, which bends by (rate gap)^2 / 4."""
+    frames = after.frame - before.frame
+    rate = abs(math.log(box_diagonal(after.box_xyxy) / box_diagonal(before.box_xyxy))) / max(1, frames)
+    return math.sqrt(4 * max_bend) / rate if rate > 0 else math.inf
+
+
+def _height(label: Keypoints) -> float:
+    return float(label.box_xyxy[3] - label.box_xyxy[1])
