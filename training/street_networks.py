@@ -120,21 +120,22 @@ class SimccNetwork(nn.Module):
 
     Args:
         schema: keypoint schema, K points.
-        size: input width and height; each a multiple of 16.
-        widths: channels at strides 4, 8 and 16.
+        size: input width and height; each a multiple of 16, or of 32 with four widths.
+        widths: channels at strides 4, 8 and 16, and perhaps 32, which sees the whole crop: left and right are not told
+            apart by what is near a point.
     """
 
     def __init__(self, schema: str, size: tuple[int, int], *, widths: Sequence[int] = (32, 56, 88)) -> None:
         super().__init__()
         points = keypoint_schema(schema).point_count
         cells = (size[0] // 8) * (size[1] // 8)
-        self.trunk = Trunk(widths, (2, 2))
+        self.trunk = Trunk(widths, (2, 2, 1)[: len(widths) - 1])
         self.pyramid = Pyramid(widths[1:], widths[1])
         self.points = nn.Conv2d(widths[1], points, 1)
         self.along_x = nn.Linear(cells, 2 * size[0])
         self.along_y = nn.Linear(cells, 2 * size[1])
         self.seen_locally = nn.Linear(cells, 1)
-        self.seen_globally = nn.Linear(widths[2], points)
+        self.seen_globally = nn.Linear(widths[-1], points)
 
     def forward(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """(N, 3, H, W) normalised RGB to logits (N, K, 2 W), (N, K, 2 H) and visibility logits (N, K)."""

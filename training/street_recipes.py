@@ -27,11 +27,12 @@ from training.street_targets import grid_cells
 ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_lane24", "street_car24_fields"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
 STEPS: dict[ModelName, int] = {
-    "street_detector": 5000, "street_car24": 1300, "street_coco17": 2400, "street_lane24": 1400,
+    "street_detector": 5000, "street_car24": 1300, "street_coco17": 4400, "street_lane24": 1400,
     "street_car24_fields": 800,
 }  # fmt: skip
 _WINDOW = (576, 384)
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
+_HEAD_WIDTHS = {"car24": (32, 56, 88), "coco17": (32, 56, 88, 72)}
 _HIDDEN_WEIGHTS = {"car24": 1.0, "coco17": 2.0}
 """A walker's far arm and leg come and go: in doubt they are called hidden."""
 _FIELD_SIZE = (529, 353)
@@ -107,7 +108,7 @@ def _head_recipe(schema: str, settings: FitSettings) -> Recipe:
 
     augment = AugmentSettings(blur_px=5, weather=0.1)
     return Recipe(
-        card=card, network=lambda: SimccNetwork(schema, size), graph=SimccGraph, loss=loss, fit=settings,
+        card=card, network=lambda: SimccNetwork(schema, size, widths=_HEAD_WIDTHS[schema]), graph=SimccGraph, loss=loss, fit=settings,
         batches=lambda pool: CropBatches(
             crops=pool.crops[card.category], schema=schema, size=size, count=64, augment=augment
         ),
