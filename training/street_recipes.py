@@ -108,7 +108,8 @@ def _head_recipe(schema: str, settings: FitSettings) -> Recipe:
 
     augment = AugmentSettings(blur_px=5, weather=0.1)
     return Recipe(
-        card=card, network=lambda: SimccNetwork(schema, size, widths=_HEAD_WIDTHS[schema]), graph=SimccGraph, loss=loss, fit=settings,
+        card=card, network=lambda: SimccNetwork(schema, size, widths=_HEAD_WIDTHS[schema]), graph=SimccGraph,
+        loss=loss, fit=settings,
         batches=lambda pool: CropBatches(
             crops=pool.crops[card.category], schema=schema, size=size, count=64, augment=augment
         ),
