@@ -13,6 +13,7 @@ from training.backbone import LatentGeometry
 from training.config import TrainConfig
 from training.flow import shift_for_tokens
 from training.stages import EGO, IMAGE, OBJECTS, reference_names
+from training.step_work import step_flops
 
 _KEPT_PER_TOKEN = 1
 """Activations kept per block and token with checkpointing, in hidden sizes: its input."""
@@ -48,7 +49,8 @@ class RunPlan:
     global_batch: int
     samples: int
     petaflops_per_step: float
-    """Forward, backward through the frozen base, and the recomputation if checkpointing is on."""
+    """Forward, backward, and the recomputation if checkpointing is on; matrix products only, a U-Net's convolutions
+    left out."""
     hours: float | None
     """At the rate that was given."""
 
@@ -93,8 +95,7 @@ def plan_run(config: TrainConfig, *, steps_per_second: float | None = None) -> R
     kept = layers * (_KEPT_PER_TOKEN if config.gradient_checkpointing else _PEAK_PER_TOKEN)
     activations = optimiser.micro_batch * most * hidden * 2 * (kept + _PEAK_PER_TOKEN)
     weight_bytes = 2 if config.backbone.dtype == "bfloat16" else 4
-    passes = 3 if config.gradient_checkpointing else 2
-    attention = 4 * layers * hidden * mean**2
+    work = step_flops(denoiser, config, tokens=mean, layers=layers, hidden=hidden)
     return RunPlan(
         name=config.name, stage=config.stage, backbone=config.backbone.name, base_parameters=base,
         trainable_parameters=trainable, target_tokens=target, most_tokens=most, mean_tokens=mean,
@@ -102,7 +103,7 @@ def plan_run(config: TrainConfig, *, steps_per_second: float | None = None) -> R
         adapter_gib=trainable * 16 / 2**30, activations_gib=activations / 2**30,
         steps=optimiser.steps, global_batch=optimiser.global_batch,
         samples=optimiser.steps * optimiser.global_batch,
-        petaflops_per_step=passes * optimiser.global_batch * (2 * base * mean + attention) / 1e15,
+        petaflops_per_step=optimiser.global_batch * work / 1e15,
         hours=optimiser.steps / steps_per_second / 3600 if steps_per_second else None,
     )  # fmt: skip
 

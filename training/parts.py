@@ -54,4 +54,5 @@ class LazyParts:
 
     def autocast(self) -> torch.autocast:
         """In training and in sampling alike: the float32 adapters multiply in the base's bfloat16."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype == torch.bfloat16)
+        kind = "cpu" if self.device.type == "meta" else self.device.type
+        return torch.autocast(kind, torch.bfloat16, enabled=self.dtype == torch.bfloat16)

@@ -20,6 +20,7 @@ from torchdata.stateful_dataloader import StatefulDataLoader
 from dataset.receipts import storage_errors
 from labeling.errors import ConfigError, DataError
 from training.adapters import trainable_count
+from training.attachment import attach_for_training
 from training.backbone import Backbone
 from training.backbones import load_backbone
 from training.batches import StepBatches, TrainingBatch, TrainingItems, collate
@@ -111,7 +112,7 @@ class Trainer:
             self.backbone.release(["vae"])
         self.keys = self.store.keys("train")
         self.items = TrainingItems(self.store, self.keys, config)
-        self.parameters = self._attach()
+        self.parameters = attach_for_training(self.backbone, config)
         self.names = [name for name, one in self.backbone.denoiser.named_parameters() if one.requires_grad]
         self.optimiser = torch.optim.AdamW(
             self.parameters, lr=config.optimiser.learning_rate, betas=config.optimiser.betas,
@@ -122,23 +123,6 @@ class Trainer:
         )
         self.step = 0
         self.loader, self.loader_start = self._resume(resume)
-
-    def _attach(self) -> list[torch.nn.Parameter]:
-        config, denoiser = self.config, self.backbone.denoiser
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(keyed_seed(config.seed, "adapter"))
-            parameters = self.backbone.attach(config.stage, config.adapter)
-        if config.gradient_checkpointing:
-            denoiser.enable_gradient_checkpointing()  # type: ignore[operator]
-        if config.compile:
-            try:
-                denoiser.compile_repeated_blocks()  # type: ignore[operator]
-            except ValueError as error:
-                raise ConfigError(
-                    f"{config.backbone.name} cannot be compiled by blocks; set compile to false"
-                ) from error
-        denoiser.train()
-        return parameters
 
     def _resume(self, resume: Resume) -> tuple[StatefulDataLoader, int]:
         root = self.out / "checkpoints"
@@ -224,9 +208,7 @@ class Trainer:
         for _ in range(self.batches.per_step):
             for batch in next(self.micro_batches):
                 total += self._backward(batch)
-        # One exchange tells every process the loss and whether any of them was asked to stop.
-        shared = self.accelerator.reduce(torch.stack([total, torch.full_like(total, float(flag.set))]), "sum")
-        loss, stop = (float(value) for value in shared)  # type: ignore[union-attr]
+        loss, stop = self._shared(total, flag)
         norm = self._gradient_norm() if math.isfinite(loss) else math.nan
         if not math.isfinite(norm):
             what = "loss" if not math.isfinite(loss) else "gradient"
@@ -239,7 +221,14 @@ class Trainer:
         self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
         self.step += 1
-        return {"loss": loss, "learning_rate": rate, "gradient_norm": norm}, stop > 0
+        return {"loss": loss, "learning_rate": rate, "gradient_norm": norm}, stop
+
+    def _shared(self, loss: torch.Tensor, flag: StopFlag) -> tuple[float, bool]:
+        """The loss over all processes, and whether any of them was asked to stop, in one exchange."""
+        if self.accelerator.num_processes == 1:
+            return float(loss), flag.set
+        both: torch.Tensor = self.accelerator.reduce(torch.stack([loss, torch.full_like(loss, float(flag.set))]), "sum")  # type: ignore[assignment]
+        return float(both[0]), float(both[1]) > 0
 
     def _backward(self, batch: TrainingBatch) -> torch.Tensor:
         device, config = self.accelerator.device, self.config

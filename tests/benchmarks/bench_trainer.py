@@ -1,18 +1,22 @@
 """What a training step costs beyond the bare loop, what the loader gives, what a checkpoint takes.
 
-The bare loop is the same network, forward, backward and AdamW on batches that are there already, and nothing else. Runs
-alternate, so that a busy machine slows both; medians of process CPU time are compared. The network is wide enough that
-a step takes 200 ms or more on one core.
+The bare loop is the same network, forward, backward and AdamW on batches that are there already, and nothing else. A
+bare step follows each step of the trainer, so that a busy machine slows both. The overhead is process CPU time outside
+the calls that both make, loading and the trainer's threads included; the difference of the two steps, which is noisier,
+stands beside it. The network is wide enough that a step takes 200 ms or more on one core.
 
-    python tests/benchmarks/bench_trainer.py [--rounds 3] [--steps 6]
+    python tests/benchmarks/bench_trainer.py [--steps 62]
 """
 
 import argparse
 import json
+import random
 import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,35 +48,90 @@ def config_for(steps: int) -> TrainConfig:
     )  # fmt: skip
 
 
-def trainer_step_ms(job: Path, folder: Path, steps: int) -> list[float]:
-    """CPU ms of each step of the real trainer, the first left out."""
-    marks: list[float] = []
+class BareLoop:
+    """The same network, forward, backward and AdamW on batches that are there already, and nothing else."""
+
+    def __init__(self, job: Path, steps: int) -> None:
+        config = config_for(steps)
+        self.backbone = load_backbone(config.backbone)
+        parameters = self.backbone.attach("motion", config.adapter)
+        self.backbone.denoiser.train()
+        self.optimiser = torch.optim.AdamW(parameters, lr=config.optimiser.learning_rate)
+        store = open_store(job, config.backbone)
+        items = TrainingItems(store, store.keys("train"), config)
+        self.batches = [collate([items[draw] for draw in draws]) for draws in StepBatches(len(items), config=config)]
+
+    def step(self, number: int) -> float:
+        """CPU ms of this thread."""
+        began = time.thread_time()
+        for batch in self.batches[number]:
+            sigma = self.backbone.sigma_from_normal(batch.normal_B, target_shape=batch.inputs.target_shape)
+            losses = self.backbone.losses(
+                batch.inputs, batch.target_BCFHW, noise_BCFHW=batch.noise_BCFHW, sigma_B=sigma
+            )
+            losses.mean().backward()
+        self.optimiser.step()
+        self.optimiser.zero_grad(set_to_none=True)
+        return 1000 * (time.thread_time() - began)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepCost:
+    """CPU ms of one step of the trainer and of the bare step after it, over the same batch."""
+
+    full: float
+    """All of the process's time but for the bare step's own: the trainer's threads are charged while that runs, too."""
+    model: float
+    """Of ``full``: inside the calls that the bare loop makes as well."""
+    bare: float
+
+
+class Stopwatch:
+    """Adds up this thread's CPU time in calls that it wraps."""
+
+    def __init__(self) -> None:
+        self.ms = 0.0
+
+    def around(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*arguments: Any, **named: Any) -> Any:
+            began = time.thread_time()
+            try:
+                return call(*arguments, **named)
+            finally:
+                self.ms += 1000 * (time.thread_time() - began)
+
+        return timed
+
+    def taken(self) -> float:
+        ms, self.ms = self.ms, 0.0
+        return ms
+
+
+def step_costs(job: Path, folder: Path, steps: int) -> list[StepCost]:
+    """The steps of one run, the first two left out."""
+    bare, costs, model = BareLoop(job, steps), [], Stopwatch()
     trainer = Trainer(config_for(steps), data=job, out=folder, resume="never", quiet=False)
     trainer._save = lambda: None  # type: ignore[method-assign]
-    trainer.run(lambda *_: marks.append(time.process_time()))
-    return [1000 * (b - a) for a, b in zip(marks, marks[1:], strict=False)]
+    trainer.backbone.losses = model.around(trainer.backbone.losses)  # type: ignore[method-assign]
+    trainer.optimiser.step = model.around(trainer.optimiser.step)  # type: ignore[method-assign]
+    backward = torch.Tensor.backward
+    mark = time.process_time()
 
+    def on_step(step: int, _: float) -> None:
+        nonlocal mark
+        inside = model.taken()
+        bare_ms = bare.step(step - 1)
+        model.taken()
+        now = time.process_time()
+        costs.append(StepCost(full=1000 * (now - mark) - bare_ms, model=inside, bare=bare_ms))
+        mark = now
 
-def bare_step_ms(job: Path, steps: int) -> list[float]:
-    """CPU ms of each bare step over the same batches, the first left out."""
-    config = config_for(steps)
-    backbone = load_backbone(config.backbone)
-    parameters = backbone.attach("motion", config.adapter)
-    backbone.denoiser.train()
-    optimiser = torch.optim.AdamW(parameters, lr=config.optimiser.learning_rate)
-    store = open_store(job, config.backbone)
-    items = TrainingItems(store, store.keys("train"), config)
-    batches = [collate([items[draw] for draw in draws]) for draws in StepBatches(len(items), config=config)]
-    marks = [time.process_time()]
-    for groups in batches:
-        for batch in groups:
-            sigma = backbone.sigma_from_normal(batch.normal_B, target_shape=batch.inputs.target_shape)
-            losses = backbone.losses(batch.inputs, batch.target_BCFHW, noise_BCFHW=batch.noise_BCFHW, sigma_B=sigma)
-            losses.mean().backward()
-        optimiser.step()
-        optimiser.zero_grad(set_to_none=True)
-        marks.append(time.process_time())
-    return [1000 * (b - a) for a, b in zip(marks[1:], marks[2:], strict=False)]
+    torch.Tensor.backward = model.around(backward)  # type: ignore[method-assign]
+    try:
+        trainer.run(on_step)
+    finally:
+        torch.Tensor.backward = backward  # type: ignore[method-assign]
+    return costs[2:]
 
 
 def loader_ms(job: Path) -> float:
@@ -153,52 +212,58 @@ def waiting_percent(folder: Path, *, step_s: float = 0.2, steps: int = 40) -> fl
     return 100 * waited / (waited + steps * step_s)
 
 
-def checkpoint_ms(job: Path, folder: Path) -> float:
-    """Wall ms to write one checkpoint, disk sync included."""
+def checkpoint_cost(job: Path, folder: Path) -> dict[str, float]:
+    """Wall seconds to write one checkpoint, disk sync and digests included, and its size."""
     trainer = Trainer(config_for(1), data=job, out=folder, quiet=True)
     trainer.run()
     costs = []
     for _ in range(5):
         began = time.perf_counter()
         trainer._save()
-        costs.append(1000 * (time.perf_counter() - began))
-    return statistics.median(costs)
+        costs.append(time.perf_counter() - began)
+    size = sum(path.stat().st_size for path in (folder / "checkpoints").rglob("*.safetensors"))
+    return {"checkpoint_wall_s": statistics.median(costs), "checkpoint_megabytes": size / 1e6}
 
 
-def measure(rounds: int, steps: int) -> dict[str, Any]:
+def paired_overhead(costs: list[StepCost]) -> float:
+    """Percent: medians compared."""
+    return 100 * (statistics.median(c.full for c in costs) / statistics.median(c.bare for c in costs) - 1)
+
+
+def paired_interval(costs: list[StepCost], *, draws: int = 500) -> list[float]:
+    """Percent: 95 of a hundred bootstrap draws lie between."""
+    rng = random.Random(0)
+    found = sorted(paired_overhead(rng.choices(costs, k=len(costs))) for _ in range(draws))
+    return [found[round(0.025 * draws)], found[round(0.975 * draws) - 1]]
+
+
+def measure(steps: int) -> dict[str, Any]:
     tiny.TINY_TRANSFORMER.clear()
     tiny.TINY_TRANSFORMER.update(WIDE)
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         job = cached_job(folder / "job")
-        bare: list[float] = []
-        full: list[float] = []
-        for turn in range(rounds):
-            # Either goes first every other time.
-            for kind in ("bare", "full") if turn % 2 else ("full", "bare"):
-                if kind == "bare":
-                    bare += bare_step_ms(job, steps)
-                else:
-                    full += trainer_step_ms(job, folder / f"run_{turn}", steps)
-        result = {
-            "threads": 1, "rounds": rounds, "steps": steps, "clock": "process CPU time",
-            "bare_step_ms": statistics.median(bare), "trainer_step_ms": statistics.median(full),
-            "loader_ms_per_tiny_sample": loader_ms(job), "loader_ms_per_real_size_sample": big_sample_ms(folder),
-            "checkpoint_wall_ms": checkpoint_ms(job, folder / "checkpoint"),
+        costs = step_costs(job, folder / "run", steps)
+        bare = statistics.median(cost.bare for cost in costs)
+        beside = statistics.median(cost.full - cost.model for cost in costs)
+        return {
+            "threads": 1, "pairs": len(costs), "clock": "process CPU time", "bare_step_ms": bare,
+            "trainer_step_ms": statistics.median(cost.full for cost in costs),
+            "ms_beside_the_model": beside, "overhead_percent": 100 * beside / bare,
+            "overhead_percent_by_difference": paired_overhead(costs),
+            "overhead_percent_by_difference_95_interval": paired_interval(costs),
+            "loader_ms_per_tiny_sample": loader_ms(job),
+            "real_size_samples_per_second_per_worker": 1000 / big_sample_ms(folder),
             "waiting_percent_of_200_ms_steps": waiting_percent(folder),
-        }  # fmt: skip
-    result["overhead_percent"] = 100 * (result["trainer_step_ms"] / result["bare_step_ms"] - 1)
-    result["real_size_samples_per_second_per_worker"] = 1000 / result["loader_ms_per_real_size_sample"]
-    return result
+        } | checkpoint_cost(job, folder / "checkpoint")  # fmt: skip
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=6)
+    parser.add_argument("--steps", type=int, default=62)
     arguments = parser.parse_args()
-    found = measure(arguments.rounds, arguments.steps)
+    found = measure(arguments.steps)
     results = Path(__file__).parent / "results"
     results.mkdir(exist_ok=True)
     (results / "trainer.json").write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
