@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,6 +23,7 @@ CHARTS: dict[str, str] = {
     "ego-video": "pipelines.charts_ego_video",
 }
 """The module of each chart; it has ``chart(name, *, quick) -> Chart``."""
+CostKind = Literal["ms_per_frame", "ms_per_step", "ms_per_clip"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,6 +68,10 @@ class Chart:
     points: tuple[ChartPoint, ...]
     machine: str
     threads: int = 1
+    cost: CostKind = "ms_per_frame"
+    """What the points' ``ms_per_frame`` counts; in the JSON it goes by this name."""
+    left_out: tuple[str, ...] = ()
+    """Methods that could not be measured here, each with its reason."""
 
 
 def machine_name() -> str:
@@ -95,6 +100,11 @@ def interleaved_ms(methods: Sequence[Callable[[], int]], *, runs: int) -> list[C
     return [Cost(median=float(np.median(taken)), p95=float(np.percentile(taken, 95)), runs=runs) for taken in samples]
 
 
+def cost_label(chart: Chart) -> str:
+    """The unit of a chart's cost, in words."""
+    return chart.cost.replace("_", " ")
+
+
 def pareto_front(points: Sequence[ChartPoint]) -> list[ChartPoint]:
     """The points that no other beats in both cost and error, cheapest first."""
     front: list[ChartPoint] = []
@@ -120,7 +130,10 @@ def run_chart(name: str, *, out: Path, quick: bool = False) -> Chart:
 def write_chart(chart: Chart, out: Path) -> None:
     """``chart-<stage>.json`` and ``chart-<stage>.png`` in the folder ``out``."""
     out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(asdict(chart), indent=1, ensure_ascii=False) + "\n"
+    tree = asdict(chart)
+    for point in tree["points"]:
+        point[chart.cost] = point.pop("ms_per_frame")
+    text = json.dumps(tree, indent=1, ensure_ascii=False) + "\n"
     (out / f"chart-{chart.stage}.json").write_text(text, encoding="utf-8")
     draw_chart(chart, out / f"chart-{chart.stage}.png")
 
@@ -144,7 +157,7 @@ def draw_chart(chart: Chart, path: Path) -> None:
         0, 1.012, f"{chart.machine}; {chart.threads} thread{'s' if chart.threads > 1 else ''}; diamonds: references; "
         "line: Pareto front", transform=every_axes[0].transAxes, fontsize=8, color="#4a5568",
     )  # fmt: skip
-    every_axes[-1].set_xlabel("cost, ms per frame (median, log)")
+    every_axes[-1].set_xlabel(f"cost, {cost_label(chart)} (median, log)")
     figure.canvas.draw()
     for axes, points in zip(every_axes, panels, strict=True):
         _name_points(axes, points)

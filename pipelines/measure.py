@@ -5,7 +5,7 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
-from pipelines.charts import pareto_front, run_chart
+from pipelines.charts import cost_label, pareto_front, run_chart
 from pipelines.console import make_console
 from pipelines.stability import run_stability
 
@@ -21,7 +21,7 @@ def show_chart(stage: str, *, out: Path, quick: bool = False) -> int:
     unit = chart.points[0].error
     table = Table(title=f"{stage}: {chart.data}", title_justify="left", box=None, pad_edge=False)
     table.add_column("method", style="bold")
-    for column in ("ms per frame", "p95", f"{unit.metric}, {unit.unit}", "p95"):
+    for column in (cost_label(chart), "p95", f"{unit.metric}, {unit.unit}", "p95"):
         table.add_column(column, justify="right")
     table.add_column("")
     for point in sorted(chart.points, key=lambda point: point.ms_per_frame.median):
@@ -30,6 +30,8 @@ def show_chart(stage: str, *, out: Path, quick: bool = False) -> int:
         table.add_row(escape(point.method), *(f"{cell:.4g}" for cell in cells), mark)
     console = make_console()
     console.print(table)
+    for line in chart.left_out:
+        console.print(f"left out: {escape(line)}")
     console.print(f"{chart.machine}; {out / f'chart-{stage}.json'}, {out / f'chart-{stage}.png'}")
     return 0
 

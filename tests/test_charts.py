@@ -41,6 +41,14 @@ def test_chart_files(tmp_path: Path) -> None:
     assert picture is not None and picture.shape[1] == 1200
 
 
+def test_another_cost_goes_by_its_own_name(tmp_path: Path) -> None:
+    chart = Chart(stage="train", data="", points=POINTS, machine="", cost="ms_per_step", left_out=("compile: none",))
+    write_chart(chart, tmp_path)
+    stored = json.loads((tmp_path / "chart-train.json").read_text())
+    assert stored["points"][1]["ms_per_step"]["median"] == 1 and "ms_per_frame" not in stored["points"][1]
+    assert stored["left_out"] == ["compile: none"]
+
+
 def test_methods_take_turns() -> None:
     order: list[str] = []
 
