@@ -27,7 +27,7 @@ from training.street_targets import grid_cells
 ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_lane24", "street_car24_fields"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
 STEPS: dict[ModelName, int] = {
-    "street_detector": 5000, "street_car24": 1300, "street_coco17": 4400, "street_lane24": 1400,
+    "street_detector": 4000, "street_car24": 1300, "street_coco17": 4400, "street_lane24": 1400,
     "street_car24_fields": 800,
 }  # fmt: skip
 _WINDOW = (576, 384)
