@@ -4,6 +4,7 @@ They are saved as a diffusers folder, so that the study's arms load them as they
 loading code, the same trainer, the same sampler. The text encoder is the random tiny T5.
 """
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,14 +66,18 @@ def study_backbone(folder: Path, *, picture: PictureConfig, name: str) -> Backbo
     )
 
 
-def train_base(folder: Path, plan: BasePlan, *, picture: PictureConfig) -> None:
-    """Train and save whatever of VAE, text encoder and transformer ``folder`` does not hold yet."""
-    if not (folder / "vae").is_dir():
-        _save(train_vae(plan), folder / "vae")
+def save_vae(folder: Path, plan: BasePlan) -> None:
+    """Train the VAE and save it beside the text encoder, unless ``folder`` has them."""
     if not (folder / "tokenizer").is_dir():
         tokenizer, encoder = tiny_text(plan.seed)
         _save(encoder, folder / "text_encoder")
         _save(tokenizer, folder / "tokenizer")
+    if not (folder / "vae").is_dir():
+        _save(train_vae(plan), folder / "vae")
+
+
+def save_denoiser(folder: Path, plan: BasePlan, *, picture: PictureConfig) -> None:
+    """Train the transformer on the latents of the VAE that ``folder`` holds, unless it is there."""
     if not (folder / "transformer").is_dir():
         _save(train_denoiser(folder, plan, picture=picture), folder / "transformer")
 
@@ -80,6 +85,7 @@ def train_base(folder: Path, plan: BasePlan, *, picture: PictureConfig) -> None:
 def _save(module: Any, folder: Path) -> None:
     """Under a temporary name first: a folder that is there is whole."""
     temporary = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(temporary, ignore_errors=True)
     module.save_pretrained(str(temporary))
     temporary.rename(folder)
 

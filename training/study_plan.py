@@ -167,7 +167,7 @@ class StudyPlan:
         return run.steps(self.scale, self.arm_tokens // len(arm.runs))
 
 
-SHARES = {"vae": 0.25, "denoiser": 0.1, "detector": 0.1, "pair": 0.06, "arms": 0.37}
+SHARES = {"vae": 0.3, "denoiser": 0.1, "detector": 0.12, "pair": 0.06, "arms": 0.3}
 """Of the budget; the rest draws streets, encodes them, samples and judges."""
 COSTS_S = {"vae": 0.12, "denoiser": 0.08, "detector": 0.2, "pair": 0.08, "token": 2.4e-4}
 """Nominal processor seconds of one step, and of one token in training (AMD EPYC, one thread)."""

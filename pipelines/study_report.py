@@ -1,0 +1,93 @@
+"""The study's results as a person sees them: a table, a chart of intervals, a contact sheet."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+_COLOURS = {"better": "#2f855a", "worse": "#c53030", "no difference": "#2b6cb0", "inconclusive": "#a0aec0"}
+_STYLES = {"better": "green", "worse": "red", "no difference": "blue", "inconclusive": "dim"}
+_TITLES = {
+    "keypoint_error": "keypoint error (box corners), px", "track_survival": "track survival, share of the clip",
+    "min_ade": "minADE, m",
+}  # fmt: skip
+_ORDER = ("truth", "through the VAE", "first frame held")
+
+
+def print_result(result: Mapping[str, Any], console: Console) -> None:
+    """The verdicts, why, and every arm's figures."""
+    table = Table(title="does the method work?", title_justify="left", box=None, pad_edge=False)
+    for column in ("question", "figure", "difference (95 %)", "verdict", "because"):
+        table.add_column(column, style="bold" if column == "question" else None)
+    for question in result["questions"]:
+        for place, (figure, finding) in enumerate(question["figures"].items()):
+            gap, verdict = finding["difference"], finding["verdict"]
+            shown = f"{gap['mean']:+.2f} ({gap['low']:+.2f} to {gap['high']:+.2f}) {finding['unit']}"
+            table.add_row(
+                escape(question["text"]) if not place else "", figure.replace("_", " "), shown,
+                f"[{_STYLES[verdict]}]{verdict}[/]", escape(finding["reason"]),
+            )  # fmt: skip
+    console.print(table)
+    console.print("differences are first minus second, turned so that more is better; keypoint error is the headline")
+    arms = Table(title="the arms, and [what they stand beside]", title_justify="left", box=None, pad_edge=False)
+    figures = ("keypoint_error", "track_survival", "recall", "min_ade", "apd")
+    for column in ("arm", *figures):
+        arms.add_column(column.replace("_", " "), justify="left" if column == "arm" else "right")
+    for name, row in result["arms"].items():
+        arms.add_row(escape(name), *(f"{row[figure]['mean']:.2f}" if figure in row else "" for figure in figures))
+    console.print(arms)
+    console.print(f"{result['processor_s']['in all'] / 60:.1f} processor minutes on {result['machine']}")
+
+
+def draw_intervals(result: Mapping[str, Any], path: Path) -> None:
+    """A panel per figure, a row per question: the paired difference with its interval, coloured by verdict."""
+    from matplotlib.figure import Figure
+
+    questions = result["questions"]
+    figure = Figure(figsize=(12, 4.6), dpi=120, layout="constrained")
+    panels = figure.subplots(1, len(_TITLES), sharey=True)
+    for panel, (name, title) in zip(panels, _TITLES.items(), strict=True):
+        panel.axvline(0, color="#4a5568", linewidth=0.8)
+        for row, question in enumerate(questions):
+            finding = question["figures"][name]
+            gap = finding["difference"]
+            colour = _COLOURS[finding["verdict"]]
+            panel.plot([gap["low"], gap["high"]], [row, row], color=colour, linewidth=3, solid_capstyle="round")
+            panel.plot(gap["mean"], row, "o", color=colour, markersize=7)
+            panel.annotate(finding["verdict"], (gap["mean"], row), xytext=(0, 8), textcoords="offset points",
+                           ha="center", fontsize=8, color=colour)  # fmt: skip
+        panel.set_title(title, fontsize=10)
+        panel.set_xlabel("second better   |   first better", fontsize=8)
+        panel.margins(x=0.15)
+        panel.grid(axis="x", alpha=0.25)
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[0].set_yticks(range(len(questions)), [question["text"] for question in questions], fontsize=9)
+    panels[0].set_ylim(len(questions) - 0.5, -0.6)
+    plan = result["plan"]
+    figure.suptitle(
+        f"animatic study: {plan['scale']['seeds']} seeds, {plan['scale']['val_clips']} streets, "
+        f"{result['processor_s']['in all'] / 60:.0f} processor minutes; paired 95 % intervals", fontsize=11,
+    )  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def draw_sheet(folder: Path, path: Path) -> None:
+    """All strips of frames under one another, named: the truth first, then every arm."""
+    strips = {file.stem: cv2.imread(str(file)) for file in sorted(folder.glob("*.png"))}
+    names = [name for name in _ORDER if name in strips] + [name for name in strips if name not in _ORDER]
+    rows = []
+    for name in names:
+        strip = strips[name]
+        assert strip is not None
+        large = cv2.resize(strip, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+        label = np.full((20, large.shape[1], 3), 255, np.uint8)
+        cv2.putText(label, name, (4, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
+        rows += [label, large]
+    if rows:
+        cv2.imwrite(str(path), np.concatenate(rows, axis=0))
