@@ -9,9 +9,11 @@ from typing import Literal
 
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
+from pipelines.reliability import ReliabilityCurve, draw_reliability
 
 STABILITY: dict[str, str] = {
     "ego": "pipelines.stability_ego",
+    "keypoints": "pipelines.stability_keypoints",
 }
 """The module of each table; it has ``stability(*, quick) -> StabilityTable``."""
 
@@ -41,6 +43,8 @@ class StabilityTable:
     data: str
     machine: str
     rows: tuple[StabilityRow, ...]
+    curves: tuple[ReliabilityCurve, ...] = ()
+    """Whether scores can be believed, where the stage gives scores; drawn as ``reliability-<stage>.png``."""
 
 
 def judged(
@@ -78,10 +82,16 @@ def run_stability(name: str, *, out: Path, quick: bool = False) -> StabilityTabl
 
 
 def write_stability(table: StabilityTable, out: Path) -> None:
-    """``stability-<stage>.json`` in the folder ``out``."""
+    """``stability-<stage>.json`` in the folder ``out``, and where the table has curves ``reliability-<stage>.png``."""
     out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(asdict(table), indent=1, ensure_ascii=False) + "\n"
+    values = asdict(table)
+    if not table.curves:
+        values.pop("curves")
+    text = json.dumps(values, indent=1, ensure_ascii=False) + "\n"
     (out / f"stability-{table.stage}.json").write_text(text, encoding="utf-8")
+    if table.curves:
+        picture = out / f"reliability-{table.stage}.png"
+        draw_reliability(table.curves, picture, title=f"{table.stage}: can scores be believed?", note=table.data)
 
 
 def make_table(stage: str, data: str, rows: Sequence[StabilityRow]) -> StabilityTable:
