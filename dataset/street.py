@@ -19,6 +19,7 @@ from dataset.street_polygons import NO_OWNER, Canvas, Polygons, blank_canvas, jo
 from dataset.street_raster import paint
 from dataset.street_scene import StillWorld, build_world, facing, plan_street
 from dataset.street_segments import segment_canvas
+from dataset.street_shutter import car_between, person_between, pose_between, row_bands
 from dataset.street_textures import HAZE, SKY_TANGENTS, SKY_TOP, street_atlas, texture_index, texture_size
 from dataset.street_traffic import CarActor, Density, PersonActor, cast_street
 from labeling.camera import Intrinsics, Trajectory, invert, rebased_trajectory
@@ -63,6 +64,9 @@ class StreetConfig:
     camera_height_m: float = 1.5
     camera_pitch_deg: float = 0.0
     """Positive looks down. A given trajectory that moves brings its own."""
+    rolling_shutter_s: float = 0.0
+    """Seconds from the first row to the last. Labels, flow, depth and the trajectory are those of the middle row's
+    time."""
     walkers_per_100_m: float | None = None
     """People per 100 m of pavement, on each side. None: as the scenario has it."""
 
@@ -73,6 +77,11 @@ class StreetConfig:
             raise ConfigError(
                 f"a street of {self.frames} frames, {self.width}x{self.height} at {self.fps:g} fps cannot be; give at "
                 "least one frame, 16x16 pixels, and a positive rate"
+            )
+        if not 0 <= self.rolling_shutter_s <= 1 / self.fps:
+            raise ConfigError(
+                f"a rolling shutter of {self.rolling_shutter_s:g} s at {self.fps:g} fps cannot be; give 0 to "
+                f"{1 / self.fps:.3g} s from the first row to the last"
             )
         if self.trajectory is not None and len(self.trajectory) < self.frames:
             raise ConfigError(
@@ -142,7 +151,8 @@ class Street:
         classes = np.zeros((0, 0), np.uint8)
         if segments:
             classes = segment_canvas(canvas, actors, cam_to_street=cam_to_street, intrinsics=self.intrinsics)
-        return StreetFrame(index=i, rgb=canvas.rgb, objects=(*objects, *lanes), segments=classes)
+        rgb = self._rolling_rgb(i) if self.config.rolling_shutter_s else canvas.rgb
+        return StreetFrame(index=i, rgb=rgb, objects=(*objects, *lanes), segments=classes)
 
     def keypoints(self, frame: StreetFrame) -> list[Keypoints]:
         """The truth as label records: score 1 where a point is visible, 0 (absent) where it is hidden."""
@@ -179,34 +189,52 @@ class Street:
             raise ConfigError(f"frame {i} of a street with {self.config.frames} frames; ask for 0 to {len(self) - 1}")
         return self.drive.cam_to_street[i]
 
+    def _rolling_rgb(self, i: int) -> np.ndarray:
+        """(H, W, 3) uint8: frame ``i`` with each band of rows at its own time."""
+        canvas = blank_canvas(self.config.width, self.config.height, SKY_TOP)
+        for rows, late in row_bands(self.config.height, shutter_s=self.config.rolling_shutter_s, fps=self.config.fps):
+            cam_to_street = pose_between(self.drive.cam_to_street, i + late)
+            cars = [car_between(car, i + late) for car in self._cars]
+            people = [person_between(person, i + late) for person in self._people]
+            self._paint(cam_to_street, self._actors_of(cars, people, 0, cam_to_street), canvas=canvas, rows=rows)
+        return canvas.rgb
+
     def _actors(self, i: int, cam_to_street: np.ndarray) -> list[Actor]:
         """Who is near and not wholly behind, from far to near."""
+        return self._actors_of(self._cars, self._people, i, cam_to_street)
+
+    def _actors_of(
+        self, cars: list[CarActor], people: list[PersonActor], i: int, cam_to_street: np.ndarray
+    ) -> list[Actor]:
         eye = cam_to_street[:3, 3]
-        found = [car_actor_now(car, i, eye=eye, sun=self._sun) for car in self._near(self._cars, i, 3.0, _CARS_M)]
-        found += [
-            person_actor_now(person, i, eye=eye, sun=self._sun)
-            for person in self._near(self._people, i, 1.5, _PEOPLE_M)
-        ]
+        near_cars = self._near(cars, i, 3.0, _CARS_M, cam_to_street)
+        near_people = self._near(people, i, 1.5, _PEOPLE_M, cam_to_street)
+        found = [car_actor_now(car, i, eye=eye, sun=self._sun) for car in near_cars]
+        found += [person_actor_now(person, i, eye=eye, sun=self._sun) for person in near_people]
         found.sort(key=lambda actor: -actor.distance_m)
         return [actor.with_owner(order + 1) for order, actor in enumerate(found[-_MOST_ACTORS:])]
 
-    def _near(self, actors: list[_Way], i: int, radius: float, farthest: float) -> list[_Way]:
+    def _near(
+        self, actors: list[_Way], i: int, radius: float, farthest: float, cam_to_street: np.ndarray
+    ) -> list[_Way]:
         """Those that may reach into the picture; a place of NaN (not there now) never does."""
         if not actors:
             return []
-        cam_to_street = self._pose(i)
         middle = np.array([actor.position[i] for actor in actors]) - (0.0, 0.9, 0.0)
         seen = self._in_view(middle, np.full(len(middle), radius), cam_to_street)
         seen &= np.linalg.norm(middle - cam_to_street[:3, 3], axis=1) < farthest
         return [actors[index] for index in np.flatnonzero(seen)]
 
-    def _paint(self, cam_to_street: np.ndarray, actors: list[Actor]) -> tuple[Canvas, np.ndarray, np.ndarray]:
+    def _paint(
+        self, cam_to_street: np.ndarray, actors: list[Actor], *, canvas: Canvas | None = None,
+        rows: tuple[int, int] | None = None,
+    ) -> tuple[Canvas, np.ndarray, np.ndarray]:  # fmt: skip
         polygons = self._visible(cam_to_street, actors)
-        canvas = blank_canvas(self.config.width, self.config.height, SKY_TOP)
+        canvas = canvas or blank_canvas(self.config.width, self.config.height, SKY_TOP)
         camera = self.intrinsics
         drawn, rejected = paint(
             canvas, polygons, world_to_cam=invert(cam_to_street), camera=(camera.fx, camera.fy, camera.cx, camera.cy),
-            atlas=street_atlas(), haze=HAZE, haze_m=_HAZE_M,
+            atlas=street_atlas(), haze=HAZE, haze_m=_HAZE_M, rows=rows,
         )  # fmt: skip
         return canvas, drawn, rejected
 
