@@ -166,3 +166,20 @@ def stability(
     from pipelines.measure import show_stability
 
     raise typer.Exit(show_stability(stage, out=out, quick=quick))
+
+
+@commands.command(rich_help_panel=MEASURE)
+def study(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of everything; a study in it goes on.")] = Path(
+        "study"
+    ),
+    budget: Annotated[
+        float | None, typer.Option(help="Processor minutes in all, nominal; by default 360, 3 h of 2 cores.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A smoke run of seconds that shows nothing.")] = False,
+    report: Annotated[bool, typer.Option("--report", help="Conclude from the seeds that are done.")] = False,
+) -> None:
+    """Does the method work? Small arms on the street at equal compute, judged by exact truth."""
+    from pipelines.study import show_study
+
+    raise typer.Exit(show_study(out, minutes=budget, quick=quick, report=report))

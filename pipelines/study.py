@@ -109,18 +109,20 @@ class Study:
 
 
 def run_study(
-    out: Path, *, minutes: float | None = None, quick: bool = False, say: Callable[[str], None] = print
-) -> dict[str, Any]:
+    out: Path, *, minutes: float | None = None, quick: bool = False, report: bool = False,
+    say: Callable[[str], None] = print,
+) -> dict[str, Any]:  # fmt: skip
     """The whole study; the tree of ``study.json``, which is written with ``study.png`` and ``study-sheet.png``.
 
     Args:
         out: folder of everything; a study in it goes on.
         minutes: processor minutes in all, nominal; None for the default.
         quick: a smoke run.
+        report: make nothing more; conclude from the seeds whose arms are all there.
         say: progress, a line at a time.
 
     Raises:
-        ConfigError: the folder holds a study of another plan, or a budget too small.
+        ConfigError: the folder holds a study of another plan, or a budget too small; a report with nothing to report.
         StorageError: the folder cannot be written to.
     """
     from pipelines.study_report import draw_intervals, draw_sheet
@@ -129,15 +131,36 @@ def run_study(
     study = Study(plan=plan, out=out, say=say)
     with storage_errors(out):
         _claim(study)
-        prepare(study)
-        for seed in range(plan.scale.seeds):
-            for arm in ARMS:
-                study.recorded(_arm_record(arm, seed), lambda arm=arm, seed=seed: run_arm(study, arm, seed))
-        result = conclude(study)
+        if not report:
+            prepare(study)
+            for seed in range(plan.scale.seeds):
+                for arm in ARMS:
+                    study.recorded(_arm_record(arm, seed), lambda arm=arm, seed=seed: run_arm(study, arm, seed))
+        result = conclude(study, seeds=_complete_seeds(study))
         atomic_write(out / "study.json", (json.dumps(result, indent=1, sort_keys=True) + "\n").encode())
         draw_intervals(result, out / "study.png")
         draw_sheet(out / "shown", out / "study-sheet.png")
     return result
+
+
+def show_study(out: Path, *, minutes: float | None, quick: bool, report: bool) -> int:
+    """``animatic study``: run, print, 0."""
+    from diffusers.utils import logging as diffusers_logging
+    from transformers.utils import logging as transformers_logging
+
+    from pipelines.console import make_console
+    from pipelines.study_report import print_result
+
+    # A bar for each of a hundred small files would bury what is said.
+    diffusers_logging.disable_progress_bar()
+    transformers_logging.disable_progress_bar()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    console = make_console()
+    result = run_study(out, minutes=minutes, quick=quick, report=report, say=console.print)
+    print_result(result, console)
+    console.print(f"{out / 'study.json'}, {out / 'study.png'}, {out / 'study-sheet.png'}")
+    return 0
 
 
 def _claim(study: Study) -> None:
@@ -269,11 +292,28 @@ def _arm_record(arm: Arm, seed: int) -> str:
     return f"arm-{arm.name.replace(' ', '-')}-seed{seed}"
 
 
-def conclude(study: Study) -> dict[str, Any]:
+def _complete_seeds(study: Study) -> list[int]:
+    """Seeds whose arms have all been judged.
+
+    Raises:
+        ConfigError: none has.
+    """
+    records = study.out / "records"
+    seeds = [
+        seed
+        for seed in range(study.plan.scale.seeds)
+        if all((records / f"{_arm_record(arm, seed)}.json").is_file() for arm in ARMS)
+    ]
+    if not seeds:
+        raise ConfigError(f"{study.out} has no seed whose arms are all judged; run the study without --report first")
+    return seeds
+
+
+def conclude(study: Study, *, seeds: Sequence[int]) -> dict[str, Any]:
     """Verdicts and all figures, as the tree of ``study.json``."""
     plan, keys = study.plan, study.keys
     truth: dict[str, Scores] = study.recorded("truth", lambda: judge_truth(study))
-    arms = {arm.name: [_clips(study, arm, seed) for seed in range(plan.scale.seeds)] for arm in ARMS}
+    arms = {arm.name: [_clips(study, arm, seed) for seed in seeds] for arm in ARMS}
     gates = {}
     for figure in JUDGED_FIGURES:
         unit, more = FIGURES[figure]
@@ -289,10 +329,10 @@ def conclude(study: Study) -> dict[str, Any]:
                 first, second, gate=gates[figure], copied=copied, truth=given, more_is_better=FIGURES[figure][1]
             )
             findings[figure] = {**asdict(finding), "unit": FIGURES[figure][0]}
-        spread = paired_interval(*_apart(arms, question.first, question.second, keys))
+        apart = table_of(arms[question.first], "apd", keys) - table_of(arms[question.second], "apd", keys)
         questions.append(
             {**asdict(question), "verdict": findings[HEADLINE]["verdict"], "figures": findings,
-             "apd_difference_m": asdict(spread)}
+             "apd_difference_m": asdict(paired_interval(apart))}
         )  # fmt: skip
     rows = {name: _means(seeds, keys) for name, seeds in arms.items()}
     rows |= {f"[{name}]": _means([scores], keys) for name, scores in truth.items()}
@@ -301,15 +341,12 @@ def conclude(study: Study) -> dict[str, Any]:
         "shipped_extractors": study.recorded("shipped", lambda: judge_shipped(study)), "plan": asdict(plan),
         "steps": {arm.name: {run.name: plan.steps(arm, run) for run in arm.runs} for arm in ARMS},
         "processor_s": _spent(study), "machine": machine_name(), "threads": torch.get_num_threads(),
+        "seeds": list(seeds),
     }  # fmt: skip
 
 
 def _clips(study: Study, arm: Arm, seed: int) -> Scores:
     return study.recorded(_arm_record(arm, seed), lambda: run_arm(study, arm, seed))["clips"]
-
-
-def _apart(arms: dict[str, list[Scores]], first: str, second: str, keys: Sequence[str]) -> tuple[np.ndarray]:
-    return (table_of(arms[first], "apd", keys) - table_of(arms[second], "apd", keys),)
 
 
 def _means(seeds: Sequence[Scores], keys: Sequence[str]) -> dict[str, Any]:

@@ -34,13 +34,15 @@ def print_result(result: Mapping[str, Any], console: Console) -> None:
             )  # fmt: skip
     console.print(table)
     console.print("differences are first minus second, turned so that more is better; keypoint error is the headline")
-    arms = Table(title="the arms, and [what they stand beside]", title_justify="left", box=None, pad_edge=False)
+    arms = Table(title=escape("the arms, and [what they stand beside]"), title_justify="left", box=None, pad_edge=False)
     figures = ("keypoint_error", "track_survival", "recall", "min_ade", "apd")
     for column in ("arm", *figures):
         arms.add_column(column.replace("_", " "), justify="left" if column == "arm" else "right")
     for name, row in result["arms"].items():
         arms.add_row(escape(name), *(f"{row[figure]['mean']:.2f}" if figure in row else "" for figure in figures))
     console.print(arms)
+    for gate in result["judge"].values():
+        console.print(f"{gate['figure'].replace('_', ' ')}: {escape(gate['reason'])}")
     console.print(f"{result['processor_s']['in all'] / 60:.1f} processor minutes on {result['machine']}")
 
 
@@ -70,7 +72,7 @@ def draw_intervals(result: Mapping[str, Any], path: Path) -> None:
     panels[0].set_ylim(len(questions) - 0.5, -0.6)
     plan = result["plan"]
     figure.suptitle(
-        f"animatic study: {plan['scale']['seeds']} seeds, {plan['scale']['val_clips']} streets, "
+        f"animatic study: {len(result['seeds'])} seeds, {plan['scale']['val_clips']} streets, "
         f"{result['processor_s']['in all'] / 60:.0f} processor minutes; paired 95 % intervals", fontsize=11,
     )  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)

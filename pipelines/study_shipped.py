@@ -30,7 +30,7 @@ def shipped_figures(clips: Sequence[StudyClip], *, small: Callable[[StudyClip], 
         clips: the first few are looked at, as drawn, not through the VAE.
         small: a clip's video at the study's size.
     """
-    chosen = clips[:_MOST_CLIPS]
+    chosen = clips[: min(_MOST_CLIPS, len(clips) // 2)]
     videos = [small(clip) for clip in chosen]
     ways = [_ego(clip, video) for clip, video in zip(chosen, videos, strict=True)]
     found = [hit for clip, video in zip(chosen, videos, strict=True) for hit in _detected(clip, video)]

@@ -130,7 +130,7 @@ def _pixels(clips: np.ndarray) -> torch.Tensor:
 @torch.no_grad()
 def _store_statistics(vae: AutoencoderKLLTXVideo, plan: BasePlan) -> None:
     """Mean and spread of each latent channel, as the released VAE carries its own."""
-    clips = [shape_video(plan.seed, one, frames=17, width=128, height=64) for one in range(32)]
+    clips = [shape_video(plan.seed, one, frames=17, width=128, height=64) for one in range(min(32, plan.videos))]
     encoded: list[Any] = [vae.encode(_pixels(clip[None])) for clip in clips]
     latents = torch.cat([one.latent_dist.mode() for one in encoded])
     vae.latents_mean.copy_(latents.mean(dim=(0, 2, 3, 4)))

@@ -38,7 +38,7 @@ class StudyScale:
     seeds: int = 3
     sampling_steps: int = 8
     batch: int = 8
-    rank: int = 64
+    rank: int = 32
     """Of the adapters."""
 
     @property
@@ -167,7 +167,7 @@ class StudyPlan:
         return run.steps(self.scale, self.arm_tokens // len(arm.runs))
 
 
-SHARES = {"vae": 0.3, "denoiser": 0.1, "detector": 0.12, "pair": 0.06, "arms": 0.3}
+SHARES = {"vae": 0.3, "denoiser": 0.06, "detector": 0.09, "pair": 0.04, "arms": 0.2}
 """Of the budget; the rest draws streets, encodes them, samples and judges."""
 COSTS_S = {"vae": 0.12, "denoiser": 0.08, "detector": 0.2, "pair": 0.08, "token": 2.4e-4}
 """Nominal processor seconds of one step, and of one token in training (AMD EPYC, one thread)."""
@@ -181,20 +181,27 @@ def plan_study(minutes: float = DEFAULT_MINUTES, *, quick: bool = False) -> Stud
         ConfigError: fewer than five minutes.
     """
     if quick:
-        scale = StudyScale(train_clips=2, val_clips=2, samples=2, seeds=2, sampling_steps=2, batch=2, rank=4)
+        scale = StudyScale(train_clips=2, val_clips=2, samples=2, seeds=1, sampling_steps=2, batch=2, rank=4)
         base = BasePlan(vae_steps=2, denoiser_steps=2, videos=2)
         return StudyPlan(minutes=0.3, scale=scale, base=base, detector_steps=2, pair_steps=2, arm_tokens=200)
     if minutes < _LEAST_MINUTES:
         raise ConfigError(
             f"a budget of {minutes:g} minutes is spent before anything is learnt; give {_LEAST_MINUTES:g}"
         )
-    scale = StudyScale() if minutes < 60 else StudyScale(train_clips=240, val_clips=30)
+    scale = _scale(minutes)
     steps = {name: max(1, round(60 * minutes * SHARES[name] / COSTS_S[name])) for name in COSTS_S if name in SHARES}
     return StudyPlan(
         minutes=minutes, scale=scale, detector_steps=steps["detector"], pair_steps=steps["pair"],
         base=BasePlan(vae_steps=steps["vae"], denoiser_steps=steps["denoiser"], videos=min(4000, 20 * round(minutes))),
         arm_tokens=round(60 * minutes * SHARES["arms"] / arm_units(scale) / COSTS_S["token"]),
     )  # fmt: skip
+
+
+def _scale(minutes: float) -> StudyScale:
+    """More streets where there is time to draw them and to judge on them."""
+    if minutes < 30:
+        return StudyScale(train_clips=40, val_clips=8, sampling_steps=6)
+    return StudyScale() if minutes < 120 else StudyScale(train_clips=240, val_clips=30)
 
 
 def arm_units(scale: StudyScale) -> float:

@@ -14,6 +14,7 @@ from labeling.errors import DataError
 from training.metrics import Interval
 
 Verdict = Literal["better", "worse", "no difference", "inconclusive"]
+LEAST_SEEDS = 3
 _DRAWS = 4000
 _SAME_SHARE = 0.1
 
@@ -95,7 +96,10 @@ def find(
     sign = 1.0 if more_is_better else -1.0
     difference = paired_interval(sign * (first - second))
     if not gate.holds:
-        return Finding(verdict="inconclusive", reason=f"the judge cannot judge: {gate.reason}", difference=difference)
+        return Finding(verdict="inconclusive", reason="the judge cannot judge this", difference=difference)
+    if len(first) < LEAST_SEEDS:
+        reason = f"{len(first)} of at least {LEAST_SEEDS} seeds"
+        return Finding(verdict="inconclusive", reason=reason, difference=difference)
     gains = [paired_interval(sign * (arm - copied[None])) for arm in (first, second)]
     if all(gain.low <= 0 for gain in gains):
         reason = "neither arm surely beats showing the first frame all the time"
