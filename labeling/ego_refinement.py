@@ -16,6 +16,8 @@ from labeling.ego_tracks import RunTracks, matched
 
 _REACHES = (1, 2, 3, 5)
 _LEAST_CORNERS = 30
+_LINK = 1e8
+"""Inverse variance, per square radian, of the difference between the changes of neighbouring steps."""
 
 
 def refined_poses(tracks: RunTracks, motion: EgoMotion, *, intrinsics: Intrinsics, noise_px: float = 0.1) -> np.ndarray:
@@ -30,24 +32,37 @@ def refined_poses(tracks: RunTracks, motion: EgoMotion, *, intrinsics: Intrinsic
     camera = intrinsics.resized(tracks.width, tracks.height)
     poses = motion.trajectory.cam_to_world
     steps = invert(poses[1:]) @ poses[:-1]
-    count = len(steps)
-    # The upper half of the banded, symmetric normal matrix as LAPACK wants it; the ones are a weak prior on no change.
-    band = 5 * max(_REACHES)
-    normal = np.zeros((band, 5 * count))
-    normal[-1] = 1.0
-    right = np.zeros(5 * count)
+    moving = motion.mode[1:] == "moving"
+    normal, right = _even_changes(moving), np.zeros(5 * len(steps))
     for reach in _REACHES:
-        for start in range(count - reach + 1):
-            if (motion.mode[start + 1 : start + reach + 1] == "moving").all():
-                found = _pair(tracks, camera, steps[start : start + reach], start, reach, noise_px / camera.fx)
-                if found is not None:
-                    part, side = found
-                    block = slice(5 * start, 5 * (start + reach))
-                    for above in range(len(part)):
-                        normal[-1 - above, block][above:] += np.diagonal(part, above)
-                    right[block] += side
-    change = solveh_banded(normal, right).reshape(count, 5)
+        for start in range(len(steps) - reach + 1):
+            inside = slice(start, start + reach)
+            found = None
+            if moving[inside].all():
+                found = _pair(tracks, camera, steps[inside], start, reach, noise_px / camera.fx)
+            if found is not None:
+                block = slice(5 * start, 5 * (start + reach))
+                right[block] += found[1]
+                for above in range(5 * reach):
+                    normal[-1 - above, block][above:] += np.diagonal(found[0], above)
+    change = solveh_banded(normal, right).reshape(-1, 5)
     return rebased_trajectory(motion.trajectory.timestamps_s, _chained(steps, change)).cam_to_world
+
+
+def _even_changes(moving: np.ndarray) -> np.ndarray:
+    """(25, 5 m) banded normal matrix, as LAPACK wants its upper half, that ties each step's change to its neighbour's.
+
+    The steps were smoothed already: what is left to mend is slow, and a change from one step to the next would only put
+    noise back. Ones on the diagonal keep what nothing speaks of where it was.
+    """
+    count = len(moving)
+    link = _LINK * np.repeat(moving[1:] & moving[:-1], 5)
+    normal = np.zeros((5 * max(_REACHES), 5 * count))
+    normal[-1] = 1.0
+    normal[-1, 5:] += link
+    normal[-1, : 5 * (count - 1)] += link
+    normal[-6, 5:] -= link
+    return normal
 
 
 def _pair(

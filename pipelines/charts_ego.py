@@ -28,7 +28,7 @@ def chart(name: str, *, quick: bool = False) -> Chart:
     timed = [
         partial(_timed, estimate, clip_of(clips[0]), found[method]) for method, (estimate, clip_of) in _METHODS.items()
     ]
-    costs = interleaved_ms(timed, runs=1 if quick else 3)
+    costs = interleaved_ms(timed, runs=1 if quick else 2)
     for method, (estimate, clip_of) in _METHODS.items():
         found[method] = [found[method][0], *(estimate(clip_of(clip)) for clip in clips[1:])]
     points = []
@@ -71,7 +71,7 @@ def _clips(quick: bool) -> list[EgoClip]:
         return [street_clip("sharp_turn", frames=24)]
     streets = [street_clip("sharp_turn"), street_clip("traffic"), highway_clip()]
     try:
-        return [kitti_clip(), *streets]
+        return [kitti_clip(frames=200), *streets]
     except DataError:
         return streets
 
