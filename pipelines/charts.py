@@ -21,6 +21,7 @@ CHARTS: dict[str, str] = {
     "count": "pipelines.charts_count",
     "ego": "pipelines.charts_ego",
     "ego-video": "pipelines.charts_ego_video",
+    "train": "pipelines.charts_train",
 }
 """The module of each chart; it has ``chart(name, *, quick) -> Chart``."""
 CostKind = Literal["ms_per_frame", "ms_per_step", "ms_per_clip"]
@@ -178,8 +179,10 @@ def _draw_panel(axes: Any, points: Sequence[ChartPoint]) -> None:
         )  # fmt: skip
     axes.set_xscale("log")
     errors = [point.error.median for point in points if point.error.median > 0]
-    if len(errors) > 1 and max(errors) > 30 * min(errors) and len(errors) == len(points):
-        axes.set_yscale("log")
+    if len(errors) > 1 and max(errors) > 30 * min(errors):
+        # Zero, the reference's own error, has no logarithm.
+        exact = len(errors) < len(points)
+        axes.set_yscale("symlog", linthresh=min(errors)) if exact else axes.set_yscale("log")
     axes.margins(x=0.18, y=0.12)
     axes.set_ylabel(f"{points[0].error.metric}, {points[0].error.unit} (median)")
     axes.grid(True, which="both", alpha=0.2)

@@ -116,7 +116,8 @@ def random_ltx(config: BackboneConfig, *, device: str = "cpu", settings: dict[st
 def _random_transformer(config: BackboneConfig, settings: dict[str, Any], device: str) -> LTXVideoTransformer3DModel:
     with torch.device("meta"):
         network = LTXVideoTransformer3DModel(**settings)
-    network = network.to(getattr(torch, config.dtype)).to_empty(device=device)
+    # diffusers' own ``to`` warns of modules that stay float32, of which this class has none.
+    network = torch.nn.Module.to(network, getattr(torch, config.dtype)).to_empty(device=device)
     if device == "meta":
         return network
     generator = torch.Generator(device).manual_seed(config.seed)
