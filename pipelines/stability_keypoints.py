@@ -51,8 +51,8 @@ _CONDITIONS: tuple[tuple[str, Condition, float | None, float, float | None], ...
 
 
 def stability(*, quick: bool = False) -> StabilityTable:
-    """Play every scenario; ``quick`` plays two conditions on one second of one street."""
-    clips = clean_clips(1 if quick else len(_SCENES), frames=24 if quick else _FRAMES)
+    """Play every scenario; ``quick`` plays two conditions on half a second of one street."""
+    clips = clean_clips(1 if quick else len(_SCENES), frames=12 if quick else _FRAMES)
     rows: list[StabilityRow] = []
     points: dict[str, list[np.ndarray]] = {"undisturbed": [], "in every condition": []}
     for effort in EFFORTS[:1] if quick else EFFORTS:
