@@ -181,8 +181,8 @@ def _draw_panel(axes: Any, points: Sequence[ChartPoint]) -> None:
     errors = [point.error.median for point in points if point.error.median > 0]
     if len(errors) > 1 and max(errors) > 30 * min(errors):
         # Zero, the reference's own error, has no logarithm.
-        exact = len(errors) < len(points)
-        axes.set_yscale("symlog", linthresh=min(errors)) if exact else axes.set_yscale("log")
+        least = 10.0 ** np.floor(np.log10(min(errors)))
+        axes.set_yscale("symlog", linthresh=least) if len(errors) < len(points) else axes.set_yscale("log")
     axes.margins(x=0.18, y=0.12)
     axes.set_ylabel(f"{points[0].error.metric}, {points[0].error.unit} (median)")
     axes.grid(True, which="both", alpha=0.2)
