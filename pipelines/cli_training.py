@@ -1,11 +1,12 @@
 """The command line's second half: training, sampling and measuring. As light to import as the first."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pipelines.cli_options import MEASURE, TRAIN, Effort, Extractors, JobFolder, Models
+from pipelines.cli_options import MEASURE, TRAIN, Effort, Extractors, JobFolder, Models, Workers
 
 commands = typer.Typer()
 
@@ -131,6 +132,7 @@ def evaluate(
     extractors: Extractors = None,
     models: Models = None,
     effort: Effort = None,
+    workers: Workers = None,
 ) -> None:
     """Generated videos against the job's clips, beside a noise floor and baselines."""
     from pipelines.evaluate import EvaluateOptions
@@ -140,6 +142,7 @@ def evaluate(
         out=out, true_skeletons=true_skeletons, trajectories=trajectories, skeletons=skeletons,
         samples_per_clip=samples_per_clip, seconds=seconds, object_variant=object_variant, every=every,
         extractors=tuple(extractors.split(",")) if extractors else None, models_dir=models, effort=effort,
+        workers=(os.cpu_count() or 1) if workers is None else workers,
     )  # fmt: skip
     raise typer.Exit(show_evaluation(job, samples, options))
 

@@ -5,11 +5,14 @@ noise floor), and two baselines go through the same estimators and scores. What 
 evaluation goes on where it was.
 """
 
+import functools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 
@@ -17,14 +20,12 @@ from dataset.loader import Sample, ShardDataset
 from dataset.receipts import atomic_write, digest, sha256_file, storage_errors
 from labeling.camera import read_tum, resample
 from labeling.errors import ConfigError
-from labeling.extraction import Effort
-from labeling.extractors import ExtractorChoice, Extractors, choose_extractors
-from pipelines.config import EFFORTS
+from labeling.extractors import Extractors, choose_extractors
 from pipelines.evaluate_notes import clip_notes, result_notes, ruler_notes
-from pipelines.job import open_job
+from pipelines.evaluate_ruler import EvaluateOptions, Ruler, check_options, read_ruler
 from training.evaluation import ClipTruth, SampleEstimate, score_clip, too_short, with_fault
 from training.evaluation_baselines import constant_velocity, held_first_frame
-from training.evaluation_estimates import ClipEstimator, EstimateSettings, clip_truth
+from training.evaluation_estimates import ClipEstimator, clip_truth
 from training.evaluation_files import CONDITIONS, SampleFiles, SampleFolder, find_samples, video_size
 from training.evaluation_report import (
     FLOOR,
@@ -41,52 +42,21 @@ from training.evaluation_report import (
 )
 
 REPORT = "evaluation.json"
-_KEPT, _VERSION = "clips.jsonl", 1
+_KEPT = "clips.jsonl"
 
 Files = Mapping[str, tuple[SampleFiles, ...]]
 """One clip's samples by set."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EvaluateOptions:
-    """Options of ``animatic evaluate``; what is None is as the job has it."""
+class _Task:
+    """One clip to be looked at."""
 
-    out: Path | None = None
-    """Folder of the results; ``evaluation`` in the samples' folder where None."""
-    true_skeletons: Path | None = None
-    """Samples painted over the true skeletons, for stage attribution."""
-    trajectories: Path | None = None
-    """Folder of imported trajectories, ``<key>[_n].tum``."""
-    skeletons: Path | None = None
-    """Folder of skeleton videos; ``skeleton`` in the samples' folder where None."""
-    samples_per_clip: int = 6
-    seconds: float | None = None
-    """Compare no more than this of each clip."""
-    object_variant: int | None = None
-    """Which of the clips' object videos the samples were conditioned on."""
-    every: int = 8
-    extractors: tuple[str, ...] | None = None
-    models_dir: Path | None = None
-    effort: str | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ruler:
-    """What every video is looked at with; the same for all, and stored with the figures."""
-
-    choice: ExtractorChoice
-    models_dir: Path | None
-    settings: EstimateSettings
-    seconds: float | None
-    object_variant: int
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain values, the extractors with their hashes."""
-        return {
-            "version": _VERSION, "extractors": {card.name: card.sha256 for card in self.choice.cards},
-            "every": self.settings.every, "effort": self.settings.effort, "seconds": self.seconds,
-            "ego": self.settings.ego.model_dump(mode="json"), "object_variant": self.object_variant,
-        }  # fmt: skip
+    sample: Sample
+    files: Files
+    asked: Path
+    """Where the trajectory that was asked for would lie."""
+    ruler: Ruler
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +89,7 @@ def evaluate(
         ModelError: an extractor that was asked for has no weights.
     """
     options = options or EvaluateOptions()
-    _check(options)
+    check_options(options)
     datasets = [ShardDataset(job, split) for split in ("val", "train")]
     clips = {sample.key: sample for dataset in datasets for sample in dataset}
     splits = {key: dataset.split for dataset in datasets for key in dataset.keys}
@@ -127,17 +97,19 @@ def evaluate(
     ruler = read_ruler(job, options)
     keys = [key for key in clips if key in folders[SAMPLES].by_key]
     out = options.out or samples / "evaluation"
-    kept, results = _KeptClips(out / _KEPT), []
-    extractors = Extractors(ruler.choice, models_dir=ruler.models_dir) if ruler.choice.cards else None
-    for number, key in enumerate(keys):
+    kept = _KeptClips(out / _KEPT)
+    tasks = {}
+    for key in keys:
         files = {name: folder.by_key.get(key, ()) for name, folder in folders.items()}
-        asked = samples / CONDITIONS / f"{key}.tum"
-        stamp = _stamp(clips[key], files, asked, ruler)
-        if stamp not in kept:
-            kept.add(stamp, _evaluate_clip(clips[key], files, asked, ruler, extractors))
-        results.append(kept[stamp])
+        task = _Task(sample=clips[key], files=files, asked=samples / CONDITIONS / f"{key}.tum", ruler=ruler)
+        tasks[_stamp(task)] = task
+    left = {stamp: task for stamp, task in tasks.items() if stamp not in kept}
+    for stamp, result in _worked(left, workers=options.workers):
+        kept.add(stamp, result)
+        left.pop(stamp)
         if on_clip is not None:
-            on_clip(number + 1, len(keys))
+            on_clip(len(tasks) - len(left), len(tasks))
+    results = [kept[stamp] for stamp in tasks]
     report = build_report(results)
     notes = (
         *clip_notes(splits, folders, options.samples_per_clip), *ruler_notes(ruler.choice, options.trajectories),
@@ -149,36 +121,6 @@ def evaluate(
     }  # fmt: skip
     atomic_write(out / REPORT, (json.dumps(finite_or_none(record), sort_keys=True, indent=1) + "\n").encode())
     return Evaluation(report=report, results=tuple(results), notes=notes, file=out / REPORT)
-
-
-def read_ruler(job: Path, options: EvaluateOptions) -> Ruler:
-    """The extractors, effort and object video of the job, where the options name no others.
-
-    Raises:
-        ConfigError: ``job.yaml`` or an option cannot be used.
-        ModelError: an extractor that was asked for has no weights.
-    """
-    known = open_job(job) if (job / "job.yaml").is_file() else None
-    names, models_dir = options.extractors, options.models_dir
-    effort, variant = options.effort, options.object_variant
-    if known is not None:
-        names, models_dir = names or known.config.keypoints.extractors, models_dir or known.models_dir
-        effort = effort or known.config.keypoints.effort
-        variant = known.config.views.object_variant if variant is None else variant
-    settings = EstimateSettings(every=options.every, effort=cast(Effort, effort or "balanced"))
-    return Ruler(
-        choice=choose_extractors(names, models_dir=models_dir), models_dir=models_dir, settings=settings,
-        seconds=options.seconds, object_variant=variant or 0,
-    )  # fmt: skip
-
-
-def _check(options: EvaluateOptions) -> None:
-    if options.effort is not None and options.effort not in EFFORTS:
-        raise ConfigError(f"effort {options.effort!r} is not known; choose one of {', '.join(EFFORTS)}")
-    if options.seconds is not None and not options.seconds > 0:
-        raise ConfigError(f"--seconds {options.seconds:g} leaves nothing to compare; give a positive duration")
-    if options.samples_per_clip < 1 or options.every < 1:
-        raise ConfigError("--samples-per-clip and --every count from 1; give at least 1")
 
 
 def _folders(samples: Path, clips: Mapping[str, Sample], options: EvaluateOptions) -> dict[str, SampleFolder]:
@@ -193,19 +135,45 @@ def _folders(samples: Path, clips: Mapping[str, Sample], options: EvaluateOption
     return folders
 
 
-def _evaluate_clip(
-    sample: Sample, files: Files, asked: Path, ruler: Ruler, extractors: Extractors | None
-) -> ClipResult:
-    condition = _asked_poses(asked, sample) if asked.is_file() else None
+def _worked(tasks: Mapping[str, _Task], *, workers: int) -> Iterator[tuple[str, ClipResult]]:
+    """Results as they come, by stamp; in this process where there is one worker or one clip.
+
+    Raises:
+        ConfigError: a worker died.
+    """
+    if min(workers, len(tasks)) < 2:
+        yield from ((stamp, _evaluate_clip(task)) for stamp, task in list(tasks.items()))
+        return
+    with ProcessPoolExecutor(min(workers, len(tasks)), mp_context=get_context("spawn")) as pool:
+        running = {pool.submit(_evaluate_clip, task): stamp for stamp, task in tasks.items()}
+        try:
+            for done in as_completed(running):
+                yield running[done], done.result()
+        except BrokenProcessPool as error:
+            raise ConfigError(
+                "a worker died, of lack of memory most likely; give fewer --workers: what is done is kept"
+            ) from error
+
+
+@functools.lru_cache(maxsize=1)
+def _opened(cards: tuple[str, ...], models_dir: Path | None) -> Extractors | None:
+    """The networks, opened once in each process."""
+    return Extractors(choose_extractors(cards, models_dir=models_dir), models_dir=models_dir) if cards else None
+
+
+def _evaluate_clip(task: _Task) -> ClipResult:
+    sample, ruler = task.sample, task.ruler
+    condition = _asked_poses(task.asked, sample) if task.asked.is_file() else None
     truth = clip_truth(sample, object_variant=ruler.object_variant, ego_condition=condition)
+    extractors = _opened(tuple(card.name for card in ruler.choice.cards), ruler.models_dir)
     looker = ClipEstimator(sample, truth, extractors=extractors, settings=ruler.settings)
     sets: dict[str, list[SampleEstimate]] = {
-        name: [looker.estimate(one) for one in these] for name, these in files.items()
+        name: [looker.estimate(one) for one in these] for name, these in task.files.items()
     }
     for name, found in sets.items():
         short = too_short(found)
         sets[name] = [with_fault(one, "video", short[one.name]) if one.name in short else one for one in found]
-    sets |= _beside(truth, looker, sets[SAMPLES], files[SAMPLES])
+    sets |= _beside(truth, looker, sets[SAMPLES], task.files[SAMPLES])
     scores = score_clip(truth, sets, seconds=ruler.seconds, floor=FLOOR)
     outcomes = {name: outcome(scores[name], found) for name, found in sets.items()}
     return ClipResult(key=truth.key, video_id=truth.video_id, split=truth.split, sets=outcomes)
@@ -236,15 +204,16 @@ def _longest_s(samples: Sequence[Sample]) -> float:
     return max((len(sample.cam_to_world) - 1) / float(sample.meta["fps"]) for sample in samples)
 
 
-def _stamp(sample: Sample, files: Files, asked: Path, ruler: Ruler) -> str:
+def _stamp(task: _Task) -> str:
     """What a clip's result depends on."""
     paths = {
-        name: [[str(part.name), sha256_file(part)] for one in these for part in _parts(one)]
-        for name, these in files.items()
+        name: [[part.name, sha256_file(part)] for one in these for part in _parts(one)]
+        for name, these in task.files.items()
     }
-    members = {suffix: member.sha256 for suffix, member in sample.members.items()}
-    wants = [one.wants_trajectory for these in files.values() for one in these]
-    return digest([ruler.as_json(), paths, wants, members, sha256_file(asked) if asked.is_file() else ""])
+    members = {suffix: member.sha256 for suffix, member in task.sample.members.items()}
+    wants = [one.wants_trajectory for these in task.files.values() for one in these]
+    asked = sha256_file(task.asked) if task.asked.is_file() else ""
+    return digest([task.ruler.as_json(), paths, wants, members, asked])
 
 
 def _parts(files: SampleFiles) -> list[Path]:

@@ -66,10 +66,9 @@ def result_notes(report: Report, results: Sequence[ClipResult], *, longest_s: fl
         notes.append(f"compared over {span} s, which truth and samples share; clips last up to {longest_s:.2f} s")
     used = [result.sets[SAMPLES].score.samples.get("min_ade_m", 0) for result in results]
     if sum(used) < judged.samples:
-        notes.append(
-            f"trajectories were found in {sum(used)} of {judged.samples} samples: minADE and APD rest on "
-            f"{sum(used) / len(used):.1f} samples of a clip, and fewer samples make minADE larger"
-        )
+        rest = f"minADE and APD rest on {sum(used) / len(used):.1f} samples of a clip, and fewer make minADE larger"
+        some = f"trajectories were found in {sum(used)} of {judged.samples} samples"
+        notes.append(f"{some}: {rest if any(used) else 'nothing can be said of how the camera moves'}")
     if len(judged.geometries) > 1:
         notes.append(
             f"samples are of {len(judged.geometries)} frame rates, sizes or lengths; each is judged at its own"

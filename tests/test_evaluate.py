@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -146,7 +148,7 @@ def test_a_second_run_looks_at_nothing_again_and_a_changed_sample_is_seen(
 
     folder, before = perfect.file.parent.parent, perfect.file.read_bytes()
     looked = []
-    monkeypatch.setattr(module, "_evaluate_clip", lambda sample, *rest: looked.append(sample.key) or perfect.results[0])
+    monkeypatch.setattr(module, "_evaluate_clip", lambda task: looked.append(task.sample.key) or perfect.results[0])
     with (perfect.file.parent / "clips.jsonl").open("a") as stream:
         stream.write('{"stamp": "torn')
     assert evaluate(job, folder, OPTIONS).report == perfect.report and not looked
@@ -155,6 +157,28 @@ def test_a_second_run_looks_at_nothing_again_and_a_changed_sample_is_seen(
     assert looked == ["avenue_0"]
     lines = (perfect.file.parent / "clips.jsonl").read_text().splitlines()
     assert len(lines) == 3 and json.loads(lines[2])["result"]["key"] == "avenue_0", "a torn line swallows no other"
+
+
+@pytest.mark.parametrize("workers", [0, 1, 4])
+def test_clips_are_shared_out_and_a_dead_worker_is_an_error(workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    import pipelines.evaluate as module
+
+    def threads(count: int, mp_context: Any) -> ThreadPoolExecutor:
+        assert workers > 1 and count == 3 and mp_context.get_start_method() == "spawn"
+        return ThreadPoolExecutor(count)
+
+    monkeypatch.setattr(module, "ProcessPoolExecutor", threads)
+    monkeypatch.setattr(module, "_evaluate_clip", lambda task: f"result of {task}")
+    tasks: Any = {"s1": "a", "s2": "b", "s3": "c"}
+    results: Any = dict(module._worked(tasks, workers=workers))
+    assert results == {"s1": "result of a", "s2": "result of b", "s3": "result of c"}
+
+    def die(task: Any) -> Any:
+        raise BrokenProcessPool("killed")
+
+    monkeypatch.setattr(module, "_evaluate_clip", die)
+    with pytest.raises(ConfigError if workers > 1 else BrokenProcessPool, match="fewer --workers|killed"):
+        dict(module._worked(tasks, workers=workers))
 
 
 def test_imported_trajectories_and_asked_ones_and_true_skeletons(
