@@ -2,7 +2,7 @@
 
 import multiprocessing
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -94,37 +94,39 @@ def chart(name: str, *, quick: bool = False) -> Chart:
 
 
 def _cpu_setup() -> _Setup:
-    base = {"width": 192, "height": 128, "rank": 64}
+    base = _Method(name="192x128, rank 64", width=192, height=128, rank=64, reference=True)
+    other = replace(base, reference=False)
+    large = replace(other, width=288, height=192)
     return _Setup(
-        recipe="tiny", frames=49, network="4 blocks of 512 channels, random weights, float32",
-        backbone={"seed": 1},
+        recipe="tiny", frames=49, network="4 blocks of 512 channels, random weights, float32", backbone={"seed": 1},
         methods=(
-            _Method(name="192x128, rank 64", reference=True, **base),
-            _Method(name="rank 8", **base | {"rank": 8}),
-            _Method(name="rank 256", **base | {"rank": 256}),
-            _Method(name="checkpointing", checkpointing=True, **base),
-            _Method(name="checkpointing, rank 8", checkpointing=True, **base | {"rank": 8}),
-            _Method(name="96x64", width=96, height=64, rank=64),
-            _Method(name="288x192", width=288, height=192, rank=64),
-            _Method(name="288x192, checkpointing", width=288, height=192, rank=64, checkpointing=True),
-            _Method(name="compiled (the compiler's memory too)", compiled=True, **base),
+            base,
+            replace(other, name="rank 8", rank=8),
+            replace(other, name="rank 256", rank=256),
+            replace(other, name="checkpointing", checkpointing=True),
+            replace(other, name="checkpointing, rank 8", checkpointing=True, rank=8),
+            replace(other, name="96x64", width=96, height=64),
+            replace(large, name="288x192"),
+            replace(large, name="288x192, checkpointing", checkpointing=True),
+            replace(other, name="compiled (the compiler's memory too)", compiled=True),
         ),
     )  # fmt: skip
 
 
 def _gpu_setup() -> _Setup:
-    base = {"width": 768, "height": 512, "rank": 512}
+    base = _Method(name="768x512, rank 512", width=768, height=512, rank=512, checkpointing=True, reference=True)
+    other = replace(base, reference=False)
     return _Setup(
-        recipe="motion_ltx_2b", frames=121, network="LTX-Video 2B, random weights, bfloat16",
+        recipe="motion_ltx_2b", frames=121, network="LTX-Video 2B, random weights, bfloat16, checkpointing",
         methods=(
-            _Method(name="768x512, rank 512, checkpointing", reference=True, checkpointing=True, **base),
-            _Method(name="no checkpointing", **base),
-            _Method(name="rank 32, checkpointing", checkpointing=True, **base | {"rank": 32}),
-            _Method(name="rank 128, checkpointing", checkpointing=True, **base | {"rank": 128}),
-            _Method(name="compiled, checkpointing", checkpointing=True, compiled=True, **base),
-            _Method(name="compiled", compiled=True, **base),
-            _Method(name="512x320, checkpointing", width=512, height=320, rank=512, checkpointing=True),
-            _Method(name="1056x704, checkpointing", width=1056, height=704, rank=512, checkpointing=True),
+            base,
+            replace(other, name="no checkpointing", checkpointing=False),
+            replace(other, name="rank 32", rank=32),
+            replace(other, name="rank 128", rank=128),
+            replace(other, name="compiled", compiled=True),
+            replace(other, name="compiled, no checkpointing", compiled=True, checkpointing=False),
+            replace(other, name="512x320", width=512, height=320),
+            replace(other, name="1056x704", width=1056, height=704),
         ),
     )  # fmt: skip
 

@@ -117,7 +117,8 @@ def _random_transformer(config: BackboneConfig, settings: dict[str, Any], device
     with torch.device("meta"):
         network = LTXVideoTransformer3DModel(**settings)
     # diffusers' own ``to`` warns of modules that stay float32, of which this class has none.
-    network = torch.nn.Module.to(network, getattr(torch, config.dtype)).to_empty(device=device)
+    torch.nn.Module.to(network, getattr(torch, config.dtype))
+    network.to_empty(device=device)
     if device == "meta":
         return network
     generator = torch.Generator(device).manual_seed(config.seed)
