@@ -120,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(json.dumps(asdict(rows[-1])))
     result = {
         "machine": torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU", "torch": torch.__version__,
-        "network": "tiny" if chosen.tiny else "LTX-Video 2B, random weights, bfloat16", 
+        "network": "tiny" if chosen.tiny else "LTX-Video 2B, random weights, bfloat16",
         "rows": [asdict(row) for row in rows],
         "gpu_hours_at_the_fastest": best_hours(rows), "paper_gpu_hours_on_gh200": PAPER_GPU_HOURS,
     }  # fmt: skip
