@@ -25,11 +25,13 @@ class EffortSettings:
     """The same while someone walks: legs swing at about 1 Hz and do not go straight."""
     max_lane_gap: int
     """The same for lane lines, which have no points to follow."""
+    news_gap: int = 12
+    """The same after something near came or went."""
     flow_step: int = 1
     """Frames between two steps of the optical flow that carries points; 0 for none: points go straight then."""
     max_bend: float = 0.03
     """Share of its size by which an object's growth may depart from a straight line where no flow follows it."""
-    max_miss: float = 0.03
+    max_miss: float = 0.05
     """Share of the box diagonal by which carried points may miss the next look before looks come closer together."""
     quiet_frames: int = 24
     """A network that has seen nothing for so long looks only every ``quiet_gap`` frames."""
@@ -38,14 +40,16 @@ class EffortSettings:
 
 EFFORTS: dict[Effort, EffortSettings] = {
     "exact": EffortSettings(max_gap=1, max_person_gap=1, max_lane_gap=1, flow_step=0, quiet_gap=1),
-    "balanced": EffortSettings(max_gap=8, max_person_gap=5, max_lane_gap=12, flow_step=2),
-    "fast": EffortSettings(max_gap=12, max_person_gap=12, max_lane_gap=12, flow_step=3, max_bend=0.05, max_miss=0.05),
+    "balanced": EffortSettings(max_gap=7, max_person_gap=4, max_lane_gap=12, news_gap=4, flow_step=2, max_miss=0.04),
+    "fast": EffortSettings(
+        max_gap=12, max_person_gap=10, max_lane_gap=12, news_gap=9, flow_step=3, max_bend=0.05, max_miss=0.08
+    ),
 }
 
 _WAITING_GAP = 6
 """While nothing has been seen for a moment only."""
 _NEAR_PX = 48.0
-"""Objects at least this high bring looks closer together when they come or go; what is far may be seen later."""
+"""Height of what is near: it brings looks closer together when it comes or goes; what is far may wait."""
 
 
 class Rhythm:
@@ -81,10 +85,10 @@ class Rhythm:
         if not seen:
             quiet = frame - (self._last_seen or 0) >= settings.quiet_frames
             return settings.quiet_gap if quiet else min(settings.max_gap, _WAITING_GAP)
-        gap = float(self.gap + 2 if miss <= settings.max_miss else self.gap // 2)
+        gap = 1.5 * self.gap + 1 if miss <= settings.max_miss else self.gap / 2
         old, new = ({label.track_id: label for label in labels} for labels in (before, seen))
         if any(_height(new.get(i) or old[i]) >= _NEAR_PX for i in set(old) ^ set(new)):
-            gap = min(gap, settings.max_gap / 2)
+            gap = min(gap, settings.news_gap)
         return min(gap, *(self._longest(label, old.get(label.track_id)) for label in seen))
 
     def _longest(self, label: Keypoints, before: Keypoints | None) -> float:

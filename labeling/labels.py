@@ -3,6 +3,7 @@
 Keypoints are the truth; skeleton, object and caption are views of them.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,7 +48,8 @@ class Keypoints:
                 f"{self.schema} needs box_xyxy (4,), points ({count}, 3) and point_source ({count},), got "
                 f"{self.box_xyxy.shape}, {self.points.shape}, {self.point_source.shape}; check the extractor's schema"
             )
-        if not (np.isfinite(self.box_xyxy).all() and np.isfinite(self.points).all() and np.isfinite(self.score)):
+        # A sum is finite only where all that went into it is: one check instead of three, for every label made.
+        if not math.isfinite(float(self.points.sum(dtype=np.float64)) + float(self.box_xyxy.sum()) + self.score):
             raise DataError(f"frame {self.frame}: a {self.category} has coordinates or scores that are not finite")
 
     @property

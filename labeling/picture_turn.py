@@ -19,11 +19,10 @@ _LEAST_RESPONSE = 0.45
 
 
 def turn_view(frame: np.ndarray) -> np.ndarray:
-    """(48, 128) float32 grey picture of the upper part of an (H, W, 3) uint8 RGB frame, for ``picture_turn``."""
-    upper = frame[: round(frame.shape[0] * _UPPER_SHARE)]
-    return cv2.cvtColor(cv2.resize(upper, _VIEW_SIZE, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY).astype(
-        np.float32
-    )
+    """(48, 128) float32 picture of the upper part of an (H, W, 3) uint8 RGB frame, for ``picture_turn``."""
+    # One channel and half of its rows and columns tell as much and cost a fifth.
+    upper = np.ascontiguousarray(frame[: round(frame.shape[0] * _UPPER_SHARE) : 2, ::2, 1])
+    return cv2.resize(upper, _VIEW_SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def picture_turn(before: np.ndarray, after: np.ndarray, *, width: int, height: int) -> np.ndarray:

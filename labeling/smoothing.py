@@ -101,13 +101,14 @@ def fill_holes(points: np.ndarray, fill_frames: int) -> tuple[np.ndarray, np.nda
     made_up = np.zeros(points.shape[:2], bool)
     for k in range(points.shape[1]):
         seen = np.flatnonzero(points[:, k, 2] > 0)
-        for before, after in zip(seen[:-1], seen[1:], strict=True):
-            if 1 < after - before <= fill_frames + 1:
-                hole = np.arange(before + 1, after)
-                share = ((hole - before) / (after - before))[:, None]
-                points[hole, k, :2] = (1 - share) * points[before, k, :2] + share * points[after, k, :2]
-                points[hole, k, 2] = min(points[before, k, 2], points[after, k, 2])
-                made_up[hole, k] = True
+        steps = np.diff(seen)
+        for n in np.flatnonzero((steps > 1) & (steps <= fill_frames + 1)):
+            before, after = seen[n], seen[n + 1]
+            hole = np.arange(before + 1, after)
+            share = ((hole - before) / (after - before))[:, None]
+            points[hole, k, :2] = (1 - share) * points[before, k, :2] + share * points[after, k, :2]
+            points[hole, k, 2] = min(points[before, k, 2], points[after, k, 2])
+            made_up[hole, k] = True
     return points, made_up
 
 
