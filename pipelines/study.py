@@ -19,12 +19,11 @@ from dataset.receipts import atomic_write, storage_errors
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
 from pipelines.study_data import StudyClip, study_clips
-from training.backbones import load_backbone
 from training.clip_views import resized
 from training.latent_store import LatentStore
 from training.metrics import Interval
 from training.study_arms import cache_rate, decoded, rate_backbone, run_config, sample_arm, through_vae, train_run
-from training.study_base import save_denoiser, save_vae
+from training.study_base import open_backbone, save_denoiser, save_vae
 from training.study_judge import PAIR_FRAMES, Judge, JudgeClip, Reading, is_counted, load_judge, train_judge
 from training.study_plan import ARMS, JUDGED_EVERY, QUESTIONS, Arm, StudyPlan, plan_study
 from training.study_scores import FIGURES, TrueTrack, clip_scores, true_tracks
@@ -176,7 +175,7 @@ def prepare(study: Study) -> None:
     plan, base = study.plan, study.base
     base.mkdir(parents=True, exist_ok=True)
     picture = plan.scale.picture(1)
-    study.recorded("vae", lambda: save_vae(base, plan.base))
+    study.recorded("vae", lambda: save_vae(base, plan.base, picture=picture))
     study.recorded("denoiser", lambda: save_denoiser(base, plan.base, picture=picture))
     study.recorded("latents", lambda: _cache(study))
     study.recorded("judge", lambda: _teach_judge(study))
@@ -197,7 +196,7 @@ def small_video(study: Study, clip: StudyClip) -> np.ndarray:
 
 
 def _vae(study: Study, step: int) -> Any:
-    return load_backbone(rate_backbone(study.base, study.plan.scale, frame_step=step), parts=["vae"])
+    return open_backbone(rate_backbone(study.base, study.plan.scale, frame_step=step))
 
 
 def judge_clips(study: Study, split: str) -> list[JudgeClip]:

@@ -34,7 +34,7 @@ def test_questions_ask_for_arms_that_exist_and_a_larger_budget_buys_more():
     assert all({question.first, question.second} <= names for question in QUESTIONS)
     small, large = plan_study(10), plan_study(300)
     assert large.arm_tokens > small.arm_tokens
-    assert large.base.vae_steps > small.base.vae_steps
+    assert large.base.denoiser_steps > small.base.denoiser_steps
     assert plan_study(10).scale.seeds >= 3
     with pytest.raises(ConfigError, match="2 minutes"):
         plan_study(2)

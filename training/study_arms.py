@@ -9,7 +9,6 @@ import torch
 
 from training.adapters import activate_adapter
 from training.backbone import Backbone, SamplingSettings, StageInputs
-from training.backbones import load_backbone
 from training.config import (
     AdapterConfig,
     BackboneConfig,
@@ -25,7 +24,7 @@ from training.draws import keyed_normal
 from training.latent_store import LatentStore
 from training.latents import cache_latents
 from training.stages import EGO, IMAGE, RGB, stack_inputs, stage_inputs, target_name
-from training.study_base import TEXT_TOKENS, study_backbone
+from training.study_base import TEXT_TOKENS, open_backbone, study_backbone
 from training.study_plan import Arm, StageRun, StudyPlan, StudyScale
 from training.trainer import TrainSummary, train
 
@@ -43,7 +42,7 @@ def cache_rate(
     folder: Path, base: Path, scale: StudyScale, *, frame_step: int, clips: Mapping[str, Sequence[Any]]
 ) -> LatentStore:
     """Latents of all clips at one frame rate; clips that are there already are kept."""
-    backbone = load_backbone(rate_backbone(base, scale, frame_step=frame_step), parts=["vae", "text"])
+    backbone = open_backbone(rate_backbone(base, scale, frame_step=frame_step))
     cache_latents(
         folder, backbone_name=backbone.config.name, backbone=backbone, datasets=clips, out=folder,
         controls=CONTROLS if frame_step == 1 else (),
@@ -72,7 +71,7 @@ def run_config(plan: StudyPlan, run: StageRun, *, steps: int, seed: int, base: P
 
 def train_run(config: TrainConfig, *, store: LatentStore, out: Path) -> tuple[Path, list[float]]:
     """The adapter of one run, and its losses; a run that was stopped goes on."""
-    summary = train(config, data=store.folder, out=out, quiet=True)
+    summary = train(config, data=store.folder, out=out, backbone=open_backbone(config.backbone), quiet=True)
     assert isinstance(summary, TrainSummary)
     return summary.adapter, list(summary.losses)
 
@@ -85,7 +84,7 @@ def sample_arm(
 
     The noise of a sample is keyed by seed, stage, clip and number: arms of one frame rate start from the same noise.
     """
-    backbone = load_backbone(rate_backbone(base, plan.scale, frame_step=arm.frame_step), parts=["denoiser"])
+    backbone = open_backbone(rate_backbone(base, plan.scale, frame_step=arm.frame_step))
     for stage, path in adapters.items():
         backbone.load_adapter(path, stage)
     backbone.denoiser.eval()

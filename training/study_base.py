@@ -1,7 +1,7 @@
-"""The study's general video model: a small LTX transformer and VAE, both trained on moving shapes and on no street.
+"""The study's general video model: a small LTX transformer and a VAE, both taught on moving shapes and on no street.
 
-They are saved as a diffusers folder, so that the study's arms load them as they would load released weights: the same
-loading code, the same trainer, the same sampler. The text encoder is the random tiny T5.
+The transformer is diffusers' class in the project's own ``LtxBackbone``, so that the study's arms go through the same
+conditioning, trainer and sampler as real ones. The text encoder is the random tiny T5.
 """
 
 import shutil
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from diffusers.models.autoencoders.autoencoder_kl_ltx import AutoencoderKLLTXVideo
 from diffusers.models.transformers.transformer_ltx import LTXVideoTransformer3DModel
 
 from training.backbone import TextEmbedding
@@ -20,38 +19,27 @@ from training.ltx import LtxBackbone
 from training.stages import stack_inputs, stage_inputs
 from training.street_fitting import FitSettings, fit
 from training.study_shapes import shape_video
-from training.tiny import TEXT_CHANNELS, TINY_VAE, seeded, tiny_text
+from training.study_vae import fit_vae, load_linear, save_linear
+from training.tiny import TEXT_CHANNELS, seeded, tiny_text
 from training.weights import load_pretrained, load_text_encoder
 
-VAE: dict[str, Any] = TINY_VAE | {
-    "block_out_channels": (16, 32, 64, 128), "decoder_block_out_channels": (32, 64, 128),
-    "layers_per_block": (1,) * 4, "decoder_layers_per_block": (1,) * 4, "spatio_temporal_scaling": (True,) * 3,
-    "decoder_spatio_temporal_scaling": (True,) * 3, "decoder_inject_noise": (False,) * 4,
-    "down_block_types": ("LTXVideo095DownBlock3D",) * 3, "downsample_type": ("spatiotemporal",) * 3,
-    "upsample_residual": (True,) * 3, "upsample_factor": (2,) * 3,
-}  # fmt: skip
-"""LTX-Video 0.9.5's VAE made small, at the true ratios (32 pixels, 8 frames, 128 channels); its residual samplers learn
-in a tenth of the steps that the plain ones need."""
 TRANSFORMER: dict[str, Any] = {
     "in_channels": 128, "out_channels": 128, "num_attention_heads": 4, "attention_head_dim": 48,
     "cross_attention_dim": 192, "num_layers": 3, "caption_channels": TEXT_CHANNELS,
 }  # fmt: skip
 """2.2 million parameters, patch 1."""
 TEXT_TOKENS = 16
-_VAE_MIX = (0.55, 0.3, 0.15)
-"""How often the VAE sees six clips of 32x32x9, three of 64x64x9, two of 64x64x17: the small ones are cheap."""
-_LATENT_NOISE = 0.05
-"""Of the latents' spread, added while the VAE learns: what is sampled later is never quite what was encoded."""
-_LEAST_STD = 0.05
+VAE_FILE = "vae.safetensors"
 _SHAPE_BATCH = 8
+_UNSEEN = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BasePlan:
     """How much the general video model learns."""
 
-    vae_steps: int
-    """Steps of the VAE, each over two to six small clips."""
+    vae_videos: int
+    """Shape videos whose components are the VAE."""
     denoiser_steps: int
     """Steps of the transformer, each over eight clips."""
     videos: int
@@ -66,14 +54,31 @@ def study_backbone(folder: Path, *, picture: PictureConfig, name: str) -> Backbo
     )
 
 
-def save_vae(folder: Path, plan: BasePlan) -> None:
-    """Train the VAE and save it beside the text encoder, unless ``folder`` has them."""
+def open_backbone(config: BackboneConfig, *, denoiser: LTXVideoTransformer3DModel | None = None) -> LtxBackbone:
+    """The backbone of ``study_backbone``, with the transformer that its folder holds or with another."""
+    folder = Path(config.weights or "")
+    return LtxBackbone(
+        config, device="cpu",
+        makers={
+            "denoiser": lambda: denoiser or _saved_transformer(folder), "vae": lambda: load_linear(folder / VAE_FILE),
+            "text": lambda: load_text_encoder(str(folder), dtype=torch.float32),
+        },
+    )  # fmt: skip
+
+
+def _saved_transformer(folder: Path) -> LTXVideoTransformer3DModel:
+    return load_pretrained(LTXVideoTransformer3DModel, str(folder), "transformer", dtype=torch.float32)
+
+
+def save_vae(folder: Path, plan: BasePlan, *, picture: PictureConfig) -> None:
+    """Fit the VAE and save it beside the text encoder, unless ``folder`` has them."""
     if not (folder / "tokenizer").is_dir():
         tokenizer, encoder = tiny_text(plan.seed)
         _save(encoder, folder / "text_encoder")
         _save(tokenizer, folder / "tokenizer")
-    if not (folder / "vae").is_dir():
-        _save(train_vae(plan), folder / "vae")
+    if not (folder / VAE_FILE).is_file():
+        size = {"width": picture.rgb_width, "height": picture.rgb_height}
+        save_linear(fit_vae(videos=plan.vae_videos, seed=plan.seed, **size), folder / VAE_FILE)
 
 
 def save_denoiser(folder: Path, plan: BasePlan, *, picture: PictureConfig) -> None:
@@ -90,64 +95,10 @@ def _save(module: Any, folder: Path) -> None:
     temporary.rename(folder)
 
 
-def train_vae(plan: BasePlan) -> AutoencoderKLLTXVideo:
-    """A VAE that gives moving shapes back; its latents' mean and spread are stored in it."""
-    vae = seeded(lambda: AutoencoderKLLTXVideo(**VAE), seed=plan.seed)
-    fitting = FitSettings(
-        seed=plan.seed, steps=plan.vae_steps, learning_rate=4e-4, average_decay=0.99, channels_last=False, name="VAE"
-    )
-    fitted: Any = fit(vae, lambda rng: _vae_batch(plan, rng), _vae_loss, fitting)
-    _store_statistics(fitted, plan)
-    return fitted
-
-
-def _vae_batch(plan: BasePlan, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    """Clips of one latent cell or of two by two, of two latent frames or three, and noise for their latents."""
-    count, side, frames = ((6, 32, 9), (3, 64, 9), (2, 64, 17))[int(rng.choice(3, p=_VAE_MIX))]
-    clips = []
-    for _ in range(count):
-        clip = shape_video(plan.seed, int(rng.integers(1 << 20, 1 << 40)), frames=frames, width=128, height=64)
-        left, top = int(rng.integers(0, 129 - side)), int(rng.integers(0, 65 - side))
-        clips.append(clip[:, top : top + side, left : left + side])
-    noise = rng.standard_normal((count, 128, (frames - 1) // 8 + 1, side // 32, side // 32), np.float32)
-    return _pixels(np.stack(clips)), torch.from_numpy(noise)
-
-
-def _vae_loss(vae: Any, batch: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
-    """What is given back from latents that are a little off, since sampled latents always are."""
-    clips, noise = batch
-    latents = vae.encode(clips).latent_dist.mode()
-    noisy = latents + _LATENT_NOISE * latents.detach().std() * noise
-    error = vae.decode(noisy, return_dict=False)[0].float() - clips
-    return error.square().mean() + 0.1 * error.abs().mean() + 1e-4 * latents.float().square().mean()
-
-
-def _pixels(clips: np.ndarray) -> torch.Tensor:
-    """(B, T, H, W, 3) uint8 to (B, 3, T, H, W) float32 from -1 to 1."""
-    return torch.from_numpy(np.ascontiguousarray(clips)).permute(0, 4, 1, 2, 3).float() / 127.5 - 1
-
-
-@torch.no_grad()
-def _store_statistics(vae: AutoencoderKLLTXVideo, plan: BasePlan) -> None:
-    """Mean and spread of each latent channel, as the released VAE carries its own."""
-    clips = [shape_video(plan.seed, one, frames=17, width=128, height=64) for one in range(min(32, plan.videos))]
-    encoded: list[Any] = [vae.encode(_pixels(clip[None])) for clip in clips]
-    latents = torch.cat([one.latent_dist.mode() for one in encoded])
-    vae.latents_mean.copy_(latents.mean(dim=(0, 2, 3, 4)))
-    vae.latents_std.copy_(latents.std(dim=(0, 2, 3, 4)).clamp(min=_LEAST_STD))
-
-
 def train_denoiser(folder: Path, plan: BasePlan, *, picture: PictureConfig) -> LTXVideoTransformer3DModel:
     """A transformer that goes on from a first frame, trained whole on the latents of shape videos."""
     network = seeded(lambda: LTXVideoTransformer3DModel(**TRANSFORMER), seed=plan.seed)
-    backbone = LtxBackbone(
-        study_backbone(folder, picture=picture, name="shapes"), device="cpu",
-        makers={
-            "denoiser": lambda: network,
-            "vae": lambda: load_pretrained(AutoencoderKLLTXVideo, str(folder), "vae", dtype=torch.float32),
-            "text": lambda: load_text_encoder(str(folder), dtype=torch.float32),
-        },
-    )  # fmt: skip
+    backbone = open_backbone(study_backbone(folder, picture=picture, name="shapes"), denoiser=network)
     latents, text = _shape_latents(backbone, plan), backbone.encode_text([""])[0]
     backbone.denoiser.requires_grad_(True)
 
@@ -171,7 +122,9 @@ def _shape_latents(backbone: LtxBackbone, plan: BasePlan) -> torch.Tensor:
     """(videos, C, F, H, W) of videos that the VAE was not trained on."""
     picture = backbone.config.picture
     size = {"frames": picture.frames or 1, "width": picture.rgb_width, "height": picture.rgb_height}
-    return torch.stack([backbone.encode_video(shape_video(plan.seed, one, **size)) for one in range(plan.videos)])
+    return torch.stack(
+        [backbone.encode_video(shape_video(plan.seed, _UNSEEN + one, **size)) for one in range(plan.videos)]
+    )
 
 
 def _shape_loss(

@@ -167,9 +167,9 @@ class StudyPlan:
         return run.steps(self.scale, self.arm_tokens // len(arm.runs))
 
 
-SHARES = {"vae": 0.3, "denoiser": 0.06, "detector": 0.09, "pair": 0.04, "arms": 0.2}
-"""Of the budget; the rest draws streets, encodes them, samples and judges."""
-COSTS_S = {"vae": 0.12, "denoiser": 0.08, "detector": 0.2, "pair": 0.08, "token": 2.4e-4}
+SHARES = {"denoiser": 0.13, "detector": 0.15, "pair": 0.05, "arms": 0.32}
+"""Of the budget; the rest fits the VAE, draws and encodes streets, samples and judges."""
+COSTS_S = {"denoiser": 0.08, "detector": 0.2, "pair": 0.08, "token": 2.4e-4}
 """Nominal processor seconds of one step, and of one token in training (AMD EPYC, one thread)."""
 _LEAST_MINUTES = 5.0
 
@@ -182,7 +182,7 @@ def plan_study(minutes: float = DEFAULT_MINUTES, *, quick: bool = False) -> Stud
     """
     if quick:
         scale = StudyScale(train_clips=2, val_clips=2, samples=2, seeds=1, sampling_steps=2, batch=2, rank=4)
-        base = BasePlan(vae_steps=2, denoiser_steps=2, videos=2)
+        base = BasePlan(vae_videos=20, denoiser_steps=2, videos=2)
         return StudyPlan(minutes=0.3, scale=scale, base=base, detector_steps=2, pair_steps=2, arm_tokens=200)
     if minutes < _LEAST_MINUTES:
         raise ConfigError(
@@ -192,7 +192,10 @@ def plan_study(minutes: float = DEFAULT_MINUTES, *, quick: bool = False) -> Stud
     steps = {name: max(1, round(60 * minutes * SHARES[name] / COSTS_S[name])) for name in COSTS_S if name in SHARES}
     return StudyPlan(
         minutes=minutes, scale=scale, detector_steps=steps["detector"], pair_steps=steps["pair"],
-        base=BasePlan(vae_steps=steps["vae"], denoiser_steps=steps["denoiser"], videos=min(4000, 20 * round(minutes))),
+        base=BasePlan(
+            vae_videos=min(1500, round(300 + 20 * minutes)), denoiser_steps=steps["denoiser"],
+            videos=min(4000, round(100 + 40 * minutes)),
+        ),
         arm_tokens=round(60 * minutes * SHARES["arms"] / arm_units(scale) / COSTS_S["token"]),
     )  # fmt: skip
 
