@@ -170,10 +170,10 @@ class ClipEstimator:
         try:
             tracks = track_run(video.frames, video.times_s, boxes=boxes, settings=self.settings.ego.tracks)
             # The camera is the clip's, so what the job knows of its pitch holds for every sample.
-            sigma = self._road.get("pitch_sigma_rad")
+            sigma, pitch = self._road.get("pitch_sigma_rad"), self._road.get("pitch_rad")
             motion = solve_run(
                 tracks, intrinsics=self._intrinsics.mapped(picture), camera_height_m=float(self._road["height_m"]),
-                pitch_rad=float(self._road["pitch_rad"]) if sigma is not None and sigma < _SURE_PITCH_RAD else None,
+                pitch_rad=pitch if sigma is not None and sigma < _SURE_PITCH_RAD else None,
                 settings=self.settings.ego,
             )  # fmt: skip
         except AnimaticError as error:
