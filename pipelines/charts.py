@@ -22,9 +22,13 @@ CHARTS: dict[str, str] = {
     "ego": "pipelines.charts_ego",
     "ego-video": "pipelines.charts_ego_video",
     "train": "pipelines.charts_train",
+    "generate": "pipelines.charts_generate",
 }
 """The module of each chart; it has ``chart(name, *, quick) -> Chart``."""
 CostKind = Literal["ms_per_frame", "ms_per_step", "ms_per_clip"]
+
+
+_LETTER_PX, _LINE_PX = 8.2, 17.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,9 +148,9 @@ def draw_chart(chart: Chart, path: Path) -> None:
     from matplotlib.figure import Figure
 
     errors = zip(*((point.error, *point.more_errors) for point in chart.points), strict=True)
+    least = _least_drawn(chart.points)
     panels = [
-        [replace(point, error=error, more_errors=()) for point, error in zip(chart.points, row, strict=True)]
-        for row in errors
+        [_as_drawn(point, error, least) for point, error in zip(chart.points, row, strict=True)] for row in errors
     ]
     height = 6.4 if len(panels) == 1 else 5.2 * len(panels)
     figure = Figure(figsize=(10, height), dpi=120, layout="constrained")
@@ -158,11 +162,24 @@ def draw_chart(chart: Chart, path: Path) -> None:
         0, 1.012, f"{chart.machine}; {chart.threads} thread{'s' if chart.threads > 1 else ''}; diamonds: references; "
         "line: Pareto front", transform=every_axes[0].transAxes, fontsize=8, color="#4a5568",
     )  # fmt: skip
-    every_axes[-1].set_xlabel(f"cost, {cost_label(chart)} (median, log)")
+    floor = f"; below {least:.2g} drawn at {least:.2g}" if least else ""
+    every_axes[-1].set_xlabel(f"cost, {cost_label(chart)} (median, log{floor})")
     figure.canvas.draw()
     for axes, points in zip(every_axes, panels, strict=True):
         _name_points(axes, points)
     figure.savefig(path)
+
+
+def _least_drawn(points: Sequence[ChartPoint]) -> float:
+    """Costs below a hundredth of the usual one are drawn there, since nobody chooses among them; 0 where none is."""
+    costs = [point.ms_per_frame.median for point in points]
+    least = float(f"{np.median(costs) / 100:.1g}")
+    return least if min(costs) < least else 0.0
+
+
+def _as_drawn(point: ChartPoint, error: Error, least_ms: float) -> ChartPoint:
+    cost = replace(point.ms_per_frame, median=max(point.ms_per_frame.median, least_ms))
+    return replace(point, ms_per_frame=cost, error=error, more_errors=())
 
 
 def _draw_panel(axes: Any, points: Sequence[ChartPoint]) -> None:
@@ -190,21 +207,49 @@ def _draw_panel(axes: Any, points: Sequence[ChartPoint]) -> None:
 
 
 def _name_points(axes: Any, points: Sequence[ChartPoint]) -> None:
-    """Names beside the points, moved up or down until they are clear of each other."""
-    taken: list[tuple[float, float, float]] = []
-    for point in sorted(points, key=lambda point: -point.error.median):
-        x, y = axes.transData.transform((point.ms_per_frame.median, point.error.median))
-        width = 8.4 * len(point.method)
-        offset = min(
-            (step for step in (15, -15, 30, -30, 45, -45, 60, -60, 75, -75)),
-            key=lambda step: (
-                any(abs(y + step - ty) < 14 and x + width > tx and x < tx + tw for tx, ty, tw in taken), abs(step)
-            ),
-        )  # fmt: skip
-        taken.append((x, y + offset, width))
+    """Names beside the points, clear of each other and of the points."""
+    at = axes.transData.transform([(point.ms_per_frame.median, point.error.median) for point in points])
+    to_points = 72 / axes.figure.dpi
+    placed = place_labels(at, [_LETTER_PX * len(point.method) for point in points], axes.bbox.extents)
+    for point, (right, up) in zip(points, placed, strict=True):
         axes.annotate(
-            point.method, (point.ms_per_frame.median, point.error.median), xytext=(7, offset * 0.6),
-            textcoords="offset points", fontsize=8.5, va="center", color="#1a202c", zorder=4,
+            point.method, (point.ms_per_frame.median, point.error.median), fontsize=8.5, va="center", color="#1a202c",
+            xytext=(right * to_points, up * to_points), textcoords="offset points", zorder=4,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
-            arrowprops={"arrowstyle": "-", "color": "#a0aec0", "lw": 0.5} if offset else None,
+            arrowprops={"arrowstyle": "-", "color": "#a0aec0", "lw": 0.5},
         )  # fmt: skip
+
+
+def place_labels(
+    points_xy: np.ndarray, widths: Sequence[float], bounds: tuple[float, float, float, float]
+) -> list[tuple[float, float]]:
+    """Where each name starts, relative to its point: on either side, above or below, clear of what stands already.
+
+    Args:
+        points_xy: (n, 2) pixels, y upwards.
+        widths: of the names, pixels.
+        bounds: left, bottom, right, top of the axes, pixels.
+    """
+    points = np.asarray(points_xy, dtype=np.float64)
+    boxes = np.zeros((0, 4))
+    placed: list[tuple[float, float]] = [(0.0, 0.0)] * len(points)
+    half = _LINE_PX / 2
+    for index in np.argsort(-points[:, 1], kind="stable"):
+        candidates = [
+            (right, float(up))
+            for up in range(-150, 151, 15)
+            for right in (12.0, -12.0 - widths[index])
+            if up or right > 0
+        ]
+        corners = np.array([(right, up - half, right + widths[index], up + half) for right, up in candidates])
+        corners += np.tile(points[index], 2)
+        covered = ((points >= corners[:, None, :2] - 5) & (points <= corners[:, None, 2:] + 5)).all(axis=-1).sum(axis=1)
+        overlaps = (
+            (corners[:, None, :2] < boxes[None, :, 2:]) & (boxes[None, :, :2] < corners[:, None, 2:])
+        ).all(axis=-1).sum(axis=1)  # fmt: skip
+        outside = (corners[:, :2] < bounds[:2]).any(axis=1) | (corners[:, 2:] > bounds[2:]).any(axis=1)
+        far = np.array([abs(up) + (25 if right < 0 else 0) for right, up in candidates])
+        best = int((1000 * overlaps + 400 * outside + 300 * covered + far).argmin())
+        boxes = np.concatenate([boxes, corners[best : best + 1]])
+        placed[index] = candidates[best]
+    return placed

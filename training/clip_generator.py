@@ -116,19 +116,36 @@ class ClipGenerator:
         if "end_to_end" in self.files:
             latents = self._rgb(conditions, "end_to_end", None, keyed=(seed, number), settings=settings)
             return GeneratedClip(rgb=self._decoded(latents, seed, number), control=None)
-        control = self._control(conditions, keyed=(seed, number), settings=settings)
-        shown = self._decoded(control, seed, number) if conditions.control is None else conditions.control
+        control = self.draft(conditions, seed=seed, number=number, settings=settings)
+        return self.paint(conditions, control, seed=seed, number=number, settings=settings)
+
+    def paint(
+        self, conditions: ClipConditions, control_CFHW: torch.Tensor, *, seed: int = 0, number: int = 0,
+        settings: SamplingSettings | None = None,
+    ) -> GeneratedClip:  # fmt: skip
+        """A drafted control video with its RGB, where there is an appearance adapter.
+
+        Raises:
+            ConfigError: sizes do not fit.
+        """
+        shown = self._decoded(control_CFHW, seed, number) if conditions.control is None else conditions.control
         if "appearance" not in self.files:
             return GeneratedClip(rgb=None, control=shown)
         rgb = self._rgb(
-            conditions, "appearance", self._handed_over(control, shown), keyed=(seed, number), settings=settings
-        )
+            conditions, "appearance", self._handed_over(control_CFHW, shown), keyed=(seed, number),
+            settings=settings or SamplingSettings(),
+        )  # fmt: skip
         return GeneratedClip(rgb=self._decoded(rgb, seed, number), control=shown)
 
-    def _control(
-        self, conditions: ClipConditions, *, keyed: tuple[int, int], settings: SamplingSettings
+    def draft(
+        self, conditions: ClipConditions, *, seed: int = 0, number: int = 0, settings: SamplingSettings | None = None
     ) -> torch.Tensor:
-        """Latents (C, F, H, W) of the control video: encoded where it is given, else sampled."""
+        """Latents (C, F, H, W) of the control video: encoded where it is given, else sampled.
+
+        Raises:
+            ConfigError: a condition is missing, or sizes do not fit.
+        """
+        settings = settings or SamplingSettings()
         picture = self.picture("motion" if "motion" in self.files else "appearance")
         size = {"width": picture.control_width, "height": picture.control_height}
         if conditions.control is not None:
@@ -140,7 +157,7 @@ class ClipGenerator:
         references = self._motion_references(conditions, picture)
         references[IMAGE] = self.backbone.encode_video(covered(conditions.image, **size)[None])
         first = self.backbone.encode_video(fitted(conditions.first_control[None], **size))
-        return self._drawn("motion", first, references, conditions, picture, keyed=keyed, settings=settings)
+        return self._drawn("motion", first, references, conditions, picture, keyed=(seed, number), settings=settings)
 
     def _motion_references(self, conditions: ClipConditions, picture: PictureConfig) -> dict[str, torch.Tensor]:
         given = {EGO: conditions.ego, OBJECTS: conditions.objects}
