@@ -111,7 +111,7 @@ def train_denoiser(folder: Path, plan: BasePlan, *, picture: PictureConfig) -> L
         return _shape_loss(backbone, batch, text)
 
     fitting = FitSettings(
-        seed=plan.seed, steps=plan.denoiser_steps, learning_rate=6e-4, average_decay=0.99, channels_last=False,
+        seed=plan.seed, steps=plan.denoiser_steps, learning_rate=1e-3, average_decay=0.99, channels_last=False,
         name="denoiser",
     )  # fmt: skip
     fitted: Any = fit(network, batch_of, loss_of, fitting)

@@ -104,7 +104,9 @@ def fit_vae(*, videos: int, width: int, height: int, seed: int) -> LinearVae:
         getattr(vae, f"{name}_mean").copy_(mean)
         getattr(vae, f"{name}_basis").copy_(basis)
         spreads.append(spread)
-    vae.latents_std.copy_(torch.stack(spreads).square().mean(dim=0).sqrt().clamp(min=1e-3).sqrt())
+    spread = torch.stack(spreads).square().mean(dim=0).sqrt().clamp(min=1e-3)
+    # Of unit variance over all components, which is what the noise levels are made for.
+    vae.latents_std.copy_(spread.sqrt() * spread.mean().sqrt())
     return vae.eval()
 
 
