@@ -28,7 +28,7 @@ CHARTS: dict[str, str] = {
 CostKind = Literal["ms_per_frame", "ms_per_step", "ms_per_clip"]
 
 
-_LETTER_PX, _LINE_PX = 8.2, 17.0
+_LETTER_PX, _LINE_PX = 8.4, 20.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,7 +164,7 @@ def draw_chart(chart: Chart, path: Path) -> None:
     )  # fmt: skip
     floor = f"; below {least:.2g} drawn at {least:.2g}" if least else ""
     every_axes[-1].set_xlabel(f"cost, {cost_label(chart)} (median, log{floor})")
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     for axes, points in zip(every_axes, panels, strict=True):
         _name_points(axes, points)
     figure.savefig(path)
@@ -212,12 +212,14 @@ def _name_points(axes: Any, points: Sequence[ChartPoint]) -> None:
     to_points = 72 / axes.figure.dpi
     placed = place_labels(at, [_LETTER_PX * len(point.method) for point in points], axes.bbox.extents)
     for point, (right, up) in zip(points, placed, strict=True):
-        axes.annotate(
+        name = axes.annotate(
             point.method, (point.ms_per_frame.median, point.error.median), fontsize=8.5, va="center", color="#1a202c",
             xytext=(right * to_points, up * to_points), textcoords="offset points", zorder=4,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
             arrowprops={"arrowstyle": "-", "color": "#a0aec0", "lw": 0.5},
         )  # fmt: skip
+        # Names must not move what they were placed against.
+        name.set_in_layout(False)
 
 
 def place_labels(

@@ -1,14 +1,26 @@
 """Charts and stability tables: the front, the files, the picture."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 
 from labeling.errors import ConfigError
-from pipelines.charts import Chart, ChartPoint, Cost, Error, interleaved_ms, pareto_front, run_chart, write_chart
+from pipelines.charts import (
+    Chart,
+    ChartPoint,
+    Cost,
+    Error,
+    interleaved_ms,
+    pareto_front,
+    place_labels,
+    run_chart,
+    write_chart,
+)
 from pipelines.stability import judged, make_table, run_stability, write_stability
 
 
@@ -47,6 +59,27 @@ def test_another_cost_goes_by_its_own_name(tmp_path: Path) -> None:
     stored = json.loads((tmp_path / "chart-train.json").read_text())
     assert stored["points"][1]["ms_per_step"]["median"] == 1 and "ms_per_frame" not in stored["points"][1]
     assert stored["left_out"] == ["compile: none"]
+
+
+def test_names_are_clear_of_each_other_and_inside() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([300, 100], [500, 300], (8, 2))
+    widths = [120.0] * 8
+    bounds = (0.0, 0.0, 800.0, 500.0)
+    starts = points + np.array(place_labels(points, widths, bounds))
+    low, high = starts - [0, 8], starts + [120, 8]
+    crossed = ((low[:, None] < high[None]) & (low[None] < high[:, None])).all(axis=-1)
+    assert crossed.sum() == len(points)
+    assert (low >= 0).all() and (high <= [800, 500]).all()
+
+
+def test_a_panel_for_each_error(tmp_path: Path) -> None:
+    other = Error(metric="yaw", unit="degrees", median=0.5, p95=1.0)
+    points = tuple(replace(point, more_errors=(other,)) for point in POINTS)
+    write_chart(Chart(stage="one", data="a street", points=POINTS, machine="a machine"), tmp_path)
+    write_chart(Chart(stage="two", data="a street", points=points, machine="a machine"), tmp_path)
+    one, two = (cv2.imread(str(tmp_path / f"chart-{name}.png")) for name in ("one", "two"))
+    assert one is not None and two is not None and two.shape[0] > 1.5 * one.shape[0]
 
 
 def test_methods_take_turns() -> None:
