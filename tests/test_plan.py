@@ -7,12 +7,14 @@ import pytest
 import yaml
 from pipeline_fixtures import SMALL, run_all, small_config, write_detector, write_street
 
+from dataset.receipts import Receipt
 from dataset.selection import read_selection
+from labeling.ego_calibration import ROAD_FRAMES
 from labeling.errors import ConfigError
 from labeling.timeline import ClipSettings
 from pipelines.commands import JobOptions
 from pipelines.job import Job, Source, find_videos
-from pipelines.plan import count_candidates, plan_job, plan_windows
+from pipelines.plan import _Measured, _scaled, count_candidates, plan_job, plan_windows
 from pipelines.plan_console import hours, show_plan, size
 
 
@@ -82,3 +84,22 @@ def test_videos_too_short_for_a_clip_are_an_error(tmp_path: Path, options: JobOp
 def test_readable_units() -> None:
     assert [hours(2.5), hours(0.5), hours(0.002)] == ["2.5 h", "30.0 min", "7.2 s"]
     assert [size(12), size(1.5e6), size(2.5e12)] == ["12 B", "1.5 MB", "2.5 TB"]
+
+
+def test_a_camera_costs_no_more_than_the_frames_that_it_is_read_from() -> None:
+    """Two hours of one video: everything made of runs grows with them, its camera only up to what is looked at."""
+
+    def receipt(stage: str, **facts: object) -> dict[str, Receipt]:
+        return {"v": Receipt(stage=stage, item="v", state="done", key="k", facts=dict(facts), seconds=10.0)}
+
+    receipts = {
+        "index": receipt("index", seconds=60.0), "count": receipt("count", clips=30),
+        "select": receipt("select", kept=15), "cut": receipt("cut", frames=720), "ego": receipt("ego"),
+        "camera": receipt("camera"),
+    }  # fmt: skip
+    measured = _Measured.of(receipts)
+    assert (measured.camera_frames, measured.frames_per_clip) == (720, 48)
+    costs = _scaled(receipts, measured, {"v": 7200.0}, candidates={"v": 3600}, sampled=1800)
+    seconds = {cost.stage: cost.core_hours * 3600 for cost in costs}
+    assert seconds["ego"] == pytest.approx(10 * 1800 / 15)
+    assert seconds["camera"] == pytest.approx(10 * ROAD_FRAMES / 720)
