@@ -23,6 +23,9 @@ CHARTS: dict[str, str] = {
     "ego-video": "pipelines.charts_ego_video",
     "train": "pipelines.charts_train",
     "generate": "pipelines.charts_generate",
+    "detect": "pipelines.charts_detect",
+    "keypoints": "pipelines.charts_keypoints",
+    "track": "pipelines.charts_track",
 }
 """The module of each chart; it has ``chart(name, *, quick) -> Chart``."""
 CostKind = Literal["ms_per_frame", "ms_per_step", "ms_per_clip"]

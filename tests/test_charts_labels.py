@@ -1,0 +1,58 @@
+"""The charts of detection, keypoints and tracks: that they run, and their trivial methods on truth."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from labeling.efforts import EFFORTS
+from pipelines import charts_detect, charts_track
+from pipelines.charts import run_chart
+from pipelines.charts_keypoints import fixed_rhythm, flow_only
+from pipelines.charts_track import TrackClip, greedy_overlap, labelled, tracked, without_ids
+from pipelines.keypoint_clips import HELD_OUT_SEED, street_extractors, street_frames
+from pipelines.keypoint_errors import match_frames, point_score
+from pipelines.track_errors import track_score
+
+
+@pytest.fixture(scope="module")
+def seen_as_it_is() -> TrackClip:
+    """A street whose looks are the truth."""
+    clip = street_frames("crossing", HELD_OUT_SEED + 3, 16, width=352, height=234)
+    looks = tuple(tuple(one for one in labels if one.category != "lane") for labels in clip.labels)
+    return TrackClip(clip=clip, looks=looks)
+
+
+def test_trackers_on_the_truth(seen_as_it_is: TrackClip) -> None:
+    truth = seen_as_it_is.clip.truth
+    scores = {
+        method.__name__: track_score(method(seen_as_it_is), truth) for method in (without_ids, greedy_overlap, tracked)
+    }
+    assert scores["tracked"].idf1 == 1.0 and scores["tracked"].switches == 0
+    assert scores["without_ids"].idf1 < 0.2 and scores["without_ids"].missed == 0
+    assert scores["greedy_overlap"].mota > 0.9
+
+
+def test_fewer_looks_keep_the_points_of_the_truth(seen_as_it_is: TrackClip) -> None:
+    for effort in (EFFORTS["balanced"], fixed_rhythm(4)):
+        found = labelled(seen_as_it_is, effort=effort)
+        assert point_score(match_frames(found, seen_as_it_is.clip.truth)).pck > 0.9
+
+
+def test_flow_alone_begins_with_a_look() -> None:
+    clip = street_frames("crossing", HELD_OUT_SEED + 3, 4, width=352, height=234)
+    found = flow_only(clip, extractors=street_extractors())
+    assert found and {label.frame for label in found} <= set(range(4))
+    assert all(np.isfinite(label.points).all() for label in found)
+
+
+@pytest.mark.parametrize("name", ["detect", "track"])
+def test_charts_run(name: str, tmp_path: Path) -> None:
+    chart = run_chart(name, out=tmp_path, quick=True)
+    stored = json.loads((tmp_path / f"chart-{name}.json").read_text())
+    methods = [point["method"] for point in stored["points"]]
+    assert methods == [point.method for point in chart.points]
+    wanted = charts_track.METHODS if name == "track" else {charts_detect.TRIVIAL}
+    assert set(wanted) <= set(methods)
+    assert (tmp_path / f"chart-{name}.png").is_file()
