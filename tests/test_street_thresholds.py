@@ -57,6 +57,13 @@ def test_the_middle_of_a_plateau_beats_a_lone_peak() -> None:
     assert best_threshold(shares, BOX_SCORES) == BOX_SCORES[7]
 
 
+def test_of_thresholds_as_good_as_the_best_the_lowest_is_taken() -> None:
+    shares = np.full(len(BOX_SCORES), 0.8)
+    shares[:3] = 0.1
+    shares[8] = 0.81
+    assert best_threshold(shares, BOX_SCORES) == BOX_SCORES[4]
+
+
 def test_bottom_up_cars_are_judged_point_by_point() -> None:
     truths = (car(0), car(300))
     tally = Tally()

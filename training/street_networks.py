@@ -81,14 +81,11 @@ class Pyramid(nn.Module):
 
 
 class StreetDetector(nn.Module):
-    """A YOLOX-like detector: one prediction per cell of strides 8, 16 and 32, one head shared by all of them.
+    """A YOLOX-like detector: one prediction per cell of strides 8, 16 and 32, one head shared by all of them."""
 
-    A last stage at stride 64 only looks: without it no cell sees both ends of a car close by.
-    """
-
-    def __init__(self, classes: int, *, widths: Sequence[int] = (32, 48, 72, 112, 112), width: int = 48) -> None:
+    def __init__(self, classes: int, *, widths: Sequence[int] = (32, 48, 72, 112), width: int = 48) -> None:
         super().__init__()
-        self.trunk = Trunk(widths, (1,) * (len(widths) - 1))
+        self.trunk = Trunk(widths, (1, 1, 1))
         self.pyramid = Pyramid(widths[1:], width)
         self.tower = nn.ModuleList(conv_unit(width, width) for _ in DETECTOR_STRIDES)
         self.head = nn.Conv2d(width, 5 + classes, 1)
@@ -97,7 +94,7 @@ class StreetDetector(nn.Module):
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
         """(N, 3, H, W) BGR 0 to 255 to (N, A, 5 + C): offset x, y, log size w, h, then logits."""
-        features = self.pyramid(self.trunk(pictures / 64.0 - 2.0))[: len(DETECTOR_STRIDES)]
+        features = self.pyramid(self.trunk(pictures / 64.0 - 2.0))
         rows = [self.head(tower(x)).flatten(2) for tower, x in zip(self.tower, features, strict=True)]
         return torch.cat(rows, dim=2).transpose(1, 2)
 

@@ -30,7 +30,7 @@ STEPS: dict[ModelName, int] = {
     "street_detector": 4000, "street_car24": 1300, "street_coco17": 4400, "street_lane24": 1400,
     "street_car24_fields": 800,
 }  # fmt: skip
-_WINDOW = (576, 384)
+_WINDOW = (416, 288)
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
 _HEAD_WIDTHS = {"car24": (32, 56, 88), "coco17": (32, 56, 88, 72)}
 _HIDDEN_WEIGHTS = {"car24": 1.0, "coco17": 2.0}
@@ -87,7 +87,7 @@ def _detector_recipe(settings: FitSettings) -> Recipe:
     )  # fmt: skip
     return Recipe(
         card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph, loss=loss, fit=settings,
-        batches=lambda pool: DetectorBatches(pool=pool, size=_WINDOW, count=6, augment=AugmentSettings()),
+        batches=lambda pool: DetectorBatches(pool=pool, size=_WINDOW, count=12, augment=AugmentSettings()),
     )  # fmt: skip
 
 

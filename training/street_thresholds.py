@@ -17,6 +17,7 @@ BOX_SCORES = tuple(float(value) for value in np.round(np.arange(0.2, 0.76, 0.05)
 """Of boxes, to choose from."""
 OBJECT_SCORES = tuple(float(value) for value in np.round(np.arange(0.16, 0.45, 0.03), 2))
 """Of bottom-up objects, to choose from."""
+_LUCK = 0.015
 JudgedFrame = tuple[np.ndarray, tuple[ObjectTruth, ...]]
 """(H, W, 3) uint8 RGB, and what is true in it."""
 
@@ -86,11 +87,13 @@ def counts_exactly(found: Detections, truths: Sequence[ObjectTruth], threshold: 
 
 
 def best_threshold(shares: np.ndarray, candidates: Sequence[float]) -> float:
-    """The candidate around which the share of exact counts is highest: a lone peak is luck.
+    """The lowest candidate around which the share of exact counts is as good as highest.
+
+    A lone peak is luck, and so is a point or two among some hundred frames: what is found more is worth more.
 
     Args:
         shares: (n,) 0 to 1, one per candidate.
         candidates: n values, rising.
     """
     smooth = np.convolve(np.pad(shares, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid")
-    return candidates[int(smooth.argmax())]
+    return candidates[int(np.flatnonzero(smooth >= smooth.max() - _LUCK)[0])]
