@@ -261,6 +261,7 @@ def test_baselines_are_what_they_say() -> None:
     scores = score_clip(clip, {"on": [on], "held": [held]})
     # The car goes 2 px a frame, at a constant velocity.
     assert scores["on"].values["box_iou"] == pytest.approx(1) and scores["on"].values["min_ade_m"] == pytest.approx(0)
+    assert scores["on"].values["truth_pck"] == 1 > scores["held"].values["truth_pck"]
     assert scores["held"].values["min_ade_m"] == pytest.approx(5)
     assert {label.frame for label in held.labels or ()} == set(range(COUNT))
     assert scores["held"].values["box_iou"] < 0.6
