@@ -28,6 +28,8 @@ _REACHES = (2, 4, 6, 8, 12, 16)
 _NOISE_PX = 0.2
 _LEAST_SHIFT, _MOST_SHIFT = 0.04, 0.2
 _LEAST_CORNERS = 60
+_LOW_ROW = 0.08
+"""Tangent below the horizon, at the prior's focal length, from which corners may be road."""
 ROAD_FRAMES = 2880
 """Frames of a video that its road is read from, spread over its runs: two minutes tell a pitch to a hundredth of a
 degree."""
@@ -202,7 +204,10 @@ def focal_from_turns(turns: list[_Turn], camera: Intrinsics, *, horizon_px: floa
     """
     if len(turns) < 3:
         return 1.0, camera.focal_sigma
-    costs = np.array([[_turn_cost(turn, camera.fx * scale, horizon_px) for scale in _SCALES] for turn in turns])
+    road_px = _LOW_ROW * camera.fx - horizon_px
+    costs = np.array([
+        [_turn_cost(turn, camera.fx * scale, horizon_px, road_px) for scale in _SCALES] for turn in turns
+    ])  # fmt: skip
     logs = np.log(_SCALES)
     # Pairs that overlap in time share their corners: they are drawn together, second by second.
     blocks = np.unique(np.array([(turn.run, turn.frame // 24) for turn in turns]), axis=0, return_inverse=True)[1]
@@ -217,8 +222,12 @@ def focal_from_turns(turns: list[_Turn], camera: Intrinsics, *, horizon_px: floa
     return float(np.exp(best)), min(sigma, max(camera.focal_sigma, 0.05))
 
 
-def _turn_cost(turn: _Turn, focal_px: float, horizon_px: float) -> float:
-    """Robust squared distances, in units of the noise, from epipolar geometry and level road, at a focal length."""
+def _turn_cost(turn: _Turn, focal_px: float, horizon_px: float, road_px: float) -> float:
+    """Robust squared distances, in units of the noise, from epipolar geometry and level road, at a focal length.
+
+    Corners below row ``road_px`` may be road: the same ones at every focal length, or fewer votes would look like fewer
+    errors.
+    """
     first, second = turn.first_px / focal_px, turn.second_px / focal_px
     weight = np.ones(len(first))
     identity, ahead = np.eye(3), np.array([0.0, 0.0, -1.0])
@@ -235,7 +244,7 @@ def _turn_cost(turn: _Turn, focal_px: float, horizon_px: float) -> float:
     behind = np.minimum(along / noise, 0.0) ** 2
     total = _bounded(square) + _bounded(behind)
     level = (second - turning_residuals(first, second, rotation))[:, 1] + horizon_px / focal_px
-    low = (square < 9) & (level > 0.08) & (along > 3 * noise)
+    low = (square < 9) & (turn.second_px[:, 1] > road_px) & (level > 0.01) & (along > 3 * noise)
     if low.sum() >= 12:
         total[low] += _bounded(_road_distance(along[low] / gain[low], noise / gain[low], level[low]))
     # Corners of one turn share their errors: at most some thirty of them are worth a vote of their own.
