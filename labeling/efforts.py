@@ -47,7 +47,7 @@ EFFORTS: dict[Effort, EffortSettings] = {
 }
 
 _WAITING_GAP = 6
-"""While nothing has been seen for a moment only."""
+"""While nothing has been seen for a moment only; where nothing has ever been seen it is quiet from the start."""
 _NEAR_PX = 48.0
 """Height of what is near: it brings looks closer together when it comes or goes; what is far may wait."""
 
@@ -75,15 +75,14 @@ class Rhythm:
             miss: how far carried points missed this look, in box diagonals.
             frame: grid number.
         """
-        first = self._last_seen is None
-        if seen or first:
+        if seen:
             self._last_seen = frame
-        self.gap = max(1, int(self._next(seen, [] if first else before, miss, frame)))
+        self.gap = max(1, int(self._next(seen, before, miss, frame)))
 
     def _next(self, seen: Sequence[Keypoints], before: Sequence[Keypoints], miss: float, frame: int) -> float:
         settings = self.settings
         if not seen:
-            quiet = frame - (self._last_seen or 0) >= settings.quiet_frames
+            quiet = self._last_seen is None or frame - self._last_seen >= settings.quiet_frames
             return settings.quiet_gap if quiet else min(settings.max_gap, _WAITING_GAP)
         gap = 1.5 * self.gap + 1 if miss <= settings.max_miss else self.gap / 2
         old, new = ({label.track_id: label for label in labels} for labels in (before, seen))

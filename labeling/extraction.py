@@ -141,6 +141,8 @@ class _Channel:
         carried = self._between.carried(number)
         seen = self._tracker.update(seen, frame=number, previous_to_current=self._turned, carried=carried)
         self._turned = np.eye(3)
+        if self._far is None and not self._tracker.idle:
+            self._far = (views.far, number)
         self.looks += 1
         between, miss = self._between.close(seen, frame=number)
         self.labels += between + seen
@@ -149,7 +151,10 @@ class _Channel:
         self._between.start(seen, frame=number, grey=views.grey if follow else None)
 
     def _turn(self, views: _Views, number: int) -> None:
-        """Add the camera's turn up to this frame to what it turned since the last look."""
+        """Add the camera's turn up to this frame to what it turned since the last look; of no use without tracks."""
+        if self._tracker.idle:
+            self._far = None
+            return
         if self._far is not None:
             height, width = views.frame.shape[:2]
             self._turned = picture_turn(self._far[0], views.far, width=width, height=height) @ self._turned

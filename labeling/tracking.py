@@ -63,6 +63,11 @@ class BoxTracker:
         self.next_id = first_id
         self._tracks: list[_Track] = []
 
+    @property
+    def following(self) -> int:
+        """How many objects it follows, lost ones counted."""
+        return len(self._tracks)
+
     def update(
         self,
         boxes_xyxy: np.ndarray,
@@ -144,6 +149,11 @@ class RunTracker:
         self._trackers: dict[str, BoxTracker | LaneTracker] = {}
         self._next_id = 0
         self._frame: int | None = None
+
+    @property
+    def idle(self) -> bool:
+        """Whether it follows nothing."""
+        return not any(tracker.following for tracker in self._trackers.values())
 
     def restart(self) -> None:
         """Forget all objects: what comes after a cut or a hole is new. Ids go on counting."""
@@ -229,6 +239,11 @@ class LaneTracker:
         self.next_id = first_id
         self.max_distance_px, self.max_lost_frames = max_distance_px, max_lost_frames
         self._lines: dict[int, tuple[np.ndarray, int]] = {}
+
+    @property
+    def following(self) -> int:
+        """How many lines it follows, lost ones counted."""
+        return len(self._lines)
 
     def update(
         self, lines: Sequence[np.ndarray], *, frame_step: int = 1, previous_to_current: np.ndarray | None = None
