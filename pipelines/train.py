@@ -1,5 +1,6 @@
 """What ``animatic cache``, ``train`` and ``generate`` do: options to the training package, and a few lines back."""
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,17 +87,25 @@ def run_train(
         recipe, data=data, out=out, resume=_resume(resume), dry_run=dry_run, steps_per_second=steps_per_second,
         on_step=on_step, quiet=on_step is not None,
     )  # fmt: skip
-    console = make_console()
     if isinstance(result, RunPlan):
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in result.rows():
             table.add_row(f"[bold]{name}[/]", value)
-        console.print(table)
+        make_console().print(table)
     else:
-        losses = result.losses
-        course = f", loss {losses[0]:.4f} to {losses[-1]:.4f}" if losses else ""
-        console.print(f"{stage}: {result.steps} steps{course}; {result.adapter}")
+        _show_run(stage, result)
     return result
+
+
+def _show_run(stage: str, summary: TrainSummary) -> None:
+    # torchrun and accelerate launch start this command once a process.
+    if os.environ.get("RANK", "0") != "0":
+        return
+    losses, console = summary.losses, make_console()
+    course = f", loss {losses[0]:.4f} to {losses[-1]:.4f}" if losses else ""
+    console.print(f"{stage}: {summary.steps} steps{course}; {summary.adapter}")
+    if summary.interrupted:
+        console.print("interrupted, and saved first; the same command goes on from there")
 
 
 def _resume(text: str) -> Any:

@@ -100,7 +100,7 @@ def test_dry_run_needs_neither_data_nor_weights_and_says_all(tmp_path: Path) -> 
         load_config("motion_ltx_2b"), data=tmp_path / "none", out=tmp_path / "out", dry_run=True, steps_per_second=0.5
     )
     text = "\n".join(f"{name}: {value}" for name, value in plan.rows())  # type: ignore[union-attr]
-    for part in ("763.4 M", "6,144", "1.92 B", "GiB", "5.0 h", "288,000 samples"):
+    for part in ("763.4 M", "6,144", "1.92 B", "GiB", "1,800 steps per hour, 5.0 h", "288,000 samples"):
         assert part in text
     assert not (tmp_path / "out").exists()
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from accelerate import Accelerator
 from training_fixtures import PICTURE, in_children, one_thread, tiny_config, tiny_job  # noqa: F401
 
 from labeling.errors import ConfigError, DataError
@@ -16,9 +17,9 @@ from training.backbones import load_backbone
 from training.batches import Draw, StepBatches, TrainingItems, collate
 from training.checkpoints import list_checkpoints, newest_checkpoint, save_checkpoint
 from training.config import TrainConfig
-from training.guards import TrainingError, memory_knobs
+from training.guards import TrainingError, memory_advice, memory_knobs
 from training.latents import open_store
-from training.run_log import read_metrics
+from training.run_log import RunLog, read_metrics
 from training.trainer import Trainer, TrainSummary, train
 
 
@@ -30,6 +31,18 @@ def run(config: TrainConfig, data: Path, out: Path, **settings: Any) -> TrainSum
 
 def files_of(checkpoint: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(checkpoint.iterdir())}
+
+
+def tensorboard_scalars(folder: Path) -> dict[str, list[float]]:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    found = {}
+    # Settings go to a file of their own.
+    for file in folder.rglob("events.out.tfevents*"):
+        events = EventAccumulator(str(file))
+        events.Reload()
+        found |= {tag: [event.value for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+    return found
 
 
 @pytest.mark.parametrize("stage", ["motion", "appearance", "end_to_end"])
@@ -44,7 +57,10 @@ def test_the_loss_falls_and_the_adapter_is_what_was_trained(stage, tiny_job: Pat
     held_out = [line["held_out/mean"] for line in metrics if "held_out/mean" in line]
     assert len(held_out) == 2 and held_out[1] < held_out[0]
     assert [line["loss"] for line in metrics if "loss" in line] == pytest.approx(list(summary.losses))
-    assert list(tmp_path.rglob("events.out.tfevents*")), "TensorBoard was not written"
+    shown = tensorboard_scalars(tmp_path)
+    assert shown["loss"] == pytest.approx(list(summary.losses), rel=1e-6)
+    assert shown["held_out/mean"] == pytest.approx(held_out, rel=1e-6)
+    assert {"learning_rate", "gradient_norm", "samples_per_second", "peak_memory_gib"} <= set(shown)
     # The adapter file, on a fresh backbone, gives the last held-out loss again.
     backbone = load_backbone(config.backbone)
     backbone.load_adapter(summary.adapter, stage)
@@ -200,6 +216,31 @@ def test_out_of_memory_says_which_knobs_to_turn_in_order(tiny_job: Path, tmp_pat
     assert not any("micro_batch" in knob or "gradient" in knob or "rank" in knob for knob in memory_knobs(thrifty))
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory"),
+        RuntimeError("CUBLAS_STATUS_ALLOC_FAILED"),
+    ],
+    ids=["python", "cpu", "cublas"],
+)  # fmt: skip
+def test_other_ways_to_run_out_of_memory_get_the_same_advice(error: Exception) -> None:
+    with pytest.raises(TrainingError, match="in this order"), memory_advice(tiny_config("motion")):
+        raise error
+    with pytest.raises(RuntimeError, match="shapes"), memory_advice(tiny_config("motion")):
+        raise RuntimeError("shapes differ")
+
+
+def test_the_line_tells_loss_speed_time_left_and_memory(tmp_path: Path, capsys) -> None:
+    log = RunLog(Accelerator(cpu=True), tmp_path, steps=4, start=0, samples_per_step=8, quiet=False)
+    with log:
+        log.step(2, {"loss": 0.1234})
+    line = " ".join(capsys.readouterr().err.split())
+    for part in ("2/4", "loss 0.1234", "steps/s", "samples/s", "GiB"):
+        assert part in line
+    assert ":" in line.split("samples/s")[1], "no time left"
+
+
 def test_torn_checkpoints_are_skipped_with_a_warning_and_the_last_n_are_kept(tmp_path: Path) -> None:
     for step in range(1, 6):
         save_checkpoint(tmp_path, step, {"a": bytes(100), "b": bytes([step])}, keep=3)
@@ -267,9 +308,15 @@ def test_validation_videos_are_written(tiny_job: Path, tmp_path: Path) -> None: 
     assert sheet is not None and sheet.shape == (2 * 64, 8 * 96, 3)
 
 
-def test_unknown_trackers_missing_latents_and_empty_splits_are_named(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_unknown_trackers_missing_latents_and_empty_splits_are_named(
+    tiny_job: Path, tmp_path: Path, monkeypatch  # noqa: F811
+) -> None:  # fmt: skip
     with pytest.raises(ConfigError, match="trackers notebook are not known.*tensorboard"):
         run(tiny_config("motion", trackers=["notebook"]), tiny_job, tmp_path)
+    # accelerate knows wandb by name; where it is not installed it would be left out without a word.
+    monkeypatch.setattr("training.trainer.get_available_trackers", list)
+    with pytest.raises(ConfigError, match="pip install wandb"):
+        run(tiny_config("motion", trackers=["wandb"]), tiny_job, tmp_path)
     with pytest.raises(DataError, match="animatic cache"):
         run(tiny_config("motion"), tmp_path, tmp_path / "out")
     with pytest.raises(DataError, match="stale.*picture"):

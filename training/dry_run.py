@@ -74,7 +74,11 @@ class RunPlan:
             ("steps", f"{self.steps:,} of {self.global_batch} samples, {self.samples:,} samples in all"),
             ("work per step", f"{self.petaflops_per_step:.2f} PFLOP"),
         ]  # fmt: skip
-        return rows + ([("time", f"{self.hours:.1f} h at the given rate")] if self.hours is not None else [])
+        if self.hours is not None:
+            rows.append(
+                ("at the given rate", f"{self.steps / self.hours:,.0f} steps per hour, {self.hours:.1f} h in all")
+            )
+        return rows
 
 
 def plan_run(config: TrainConfig, *, steps_per_second: float | None = None) -> RunPlan:

@@ -54,12 +54,20 @@ def memory_advice(config: TrainConfig) -> Iterator[None]:
     """
     try:
         yield
-    except torch.OutOfMemoryError as error:
+    except (RuntimeError, MemoryError) as error:
+        if not _is_memory(error):
+            raise
         advice = memory_knobs(config)
         raise TrainingError(
             f"out of memory in the {config.stage} stage at micro_batch {config.optimiser.micro_batch}; "
             f"in this order: {'; '.join(advice)}"
         ) from error
+
+
+def _is_memory(error: Exception) -> bool:
+    """A GPU's own error, Python's, or the words of torch's CPU allocator and of cuBLAS."""
+    known = isinstance(error, torch.OutOfMemoryError | MemoryError)
+    return known or any(words in str(error) for words in ("can't allocate memory", "ALLOC_FAILED"))
 
 
 def memory_knobs(config: TrainConfig) -> list[str]:

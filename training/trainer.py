@@ -14,6 +14,7 @@ from typing import Literal
 
 import torch
 from accelerate import Accelerator
+from accelerate.tracking import get_available_trackers
 from accelerate.utils import LoggerType
 from torchdata.stateful_dataloader import StatefulDataLoader
 
@@ -307,6 +308,10 @@ def _accelerator(config: TrainConfig, out: Path) -> Accelerator:
         raise ConfigError(
             f"trackers {', '.join(unknown)} are not known to accelerate; choose of {', '.join(sorted(known))}"
         )
+    # accelerate leaves out, without a word, what is not installed.
+    absent = [name for name in config.trackers if name not in {str(kind) for kind in get_available_trackers()}]
+    if absent:
+        raise ConfigError(f"trackers {', '.join(absent)} are not installed; `pip install {' '.join(absent)}`")
     # Precision is the backbone's affair: accelerate would fix it for the whole process, and two runs may differ.
     accelerator = Accelerator(
         mixed_precision="no", log_with=list(config.trackers) or None, project_dir=str(out),
