@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from labeling.labels import UNTRACKED, Keypoints
-from labeling.tracking import BoxTracker, LaneTracker, assign_tracks, drop_passing_tracks, iou, line_distance
+from labeling.tracking import (
+    BoxTracker,
+    LaneTracker,
+    RunTracker,
+    assign_tracks,
+    drop_passing_tracks,
+    iou,
+    line_distance,
+)
 
 
 def box(x: float, y: float = 300, *, width: float = 40, height: float = 100) -> np.ndarray:
@@ -136,3 +144,37 @@ def test_a_row_of_parked_cars_does_not_move_up_by_one() -> None:
     ids = [tracker.update(np.array(row[:-1]), np.ones(9)).tolist() for _ in range(5)][-1]
     later = tracker.update(np.array(row[1:]), np.ones(9)).tolist()
     assert later[:-1] == ids[1:] and later[-1] not in ids
+
+
+def test_a_track_is_where_flow_took_it() -> None:
+    """A jump of three widths keeps its id when flow has followed it, and is a new object when nothing did."""
+    for carried, same in ((None, False), ({0: box(390, width=30)}, True)):
+        tracker = BoxTracker()
+        before = tracker.update(box(300, width=30)[None], np.ones(1))[0]
+        after = tracker.update(box(390, width=30)[None], np.ones(1), frame_step=4, carried=carried)[0]
+        assert bool(before == after) is same
+
+
+def test_flow_alone_keeps_no_track_alive() -> None:
+    tracker = BoxTracker()
+    tracker.update(box(300)[None], np.ones(1))
+    for _ in range(4):
+        tracker.update(np.zeros((0, 4)), np.zeros(0), frame_step=8, carried={0: box(300)})
+    assert not tracker.following
+
+
+def test_an_idle_tracker_follows_nothing() -> None:
+    tracker = RunTracker()
+    assert tracker.idle
+    tracker.update([car(0, 100)], frame=0)
+    assert not tracker.idle
+    tracker.restart()
+    assert tracker.idle
+
+
+def test_lines_are_compared_where_the_turn_took_them() -> None:
+    shift = np.array([[1.0, 0, 300], [0, 1, 0], [0, 0, 1]])
+    turned = [line + np.array([300, 0, 0]) for line in (lane(-150), lane(150))]
+    tracker = LaneTracker()
+    assert tracker.update([lane(-150), lane(150)]).tolist() == [0, 1]
+    assert tracker.update(turned, previous_to_current=shift).tolist() == [0, 1]

@@ -1,0 +1,66 @@
+"""What is shown between two looks: carried on, carried back, cut at the border, and never for long."""
+
+from dataclasses import replace
+
+import numpy as np
+from moving_card import MovingCard
+
+from labeling.between_looks import BetweenLooks
+from labeling.carrying import small_grey
+from labeling.labels import Keypoints
+
+SCENE = MovingCard(speed=1.5)
+
+
+def grey(frame: int) -> np.ndarray:
+    return small_grey(SCENE.render(frame))
+
+
+def seen(frame: int, *, track_id: int = 0) -> Keypoints:
+    return replace(SCENE.label(frame), track_id=track_id)
+
+
+def carried_to(end: int, *, first: list[Keypoints], shown: int = 4) -> BetweenLooks:
+    """A look at frame 0 whose objects flow has taken to ``end``, two frames a step."""
+    between = BetweenLooks(flow_step=2, shown_frames=shown)
+    between.start(first, frame=0, grey=grey(0))
+    for frame in range(2, end + 1, 2):
+        assert between.due(frame) and not between.due(frame - 1)
+        assert between.carry(grey(frame), frame=frame)
+    return between
+
+
+def test_an_object_seen_twice_is_shown_in_every_frame_between() -> None:
+    labels, miss = carried_to(6, first=[seen(0)]).close([seen(6)], frame=6)
+    assert [label.frame for label in labels] == [1, 2, 3, 4, 5] and miss < 0.01
+    for label in labels:
+        assert np.abs(label.points[:, :2] - SCENE.truth(label.frame)).max() < 0.5
+
+
+def test_a_lost_object_is_carried_on_for_a_while() -> None:
+    labels, _ = carried_to(8, first=[seen(0)]).close([], frame=8)
+    assert [label.frame for label in labels] == [1, 2, 3, 4]
+
+
+def test_a_new_object_is_carried_back_for_a_while() -> None:
+    """Another object was there all the time, so that flow has a way; the new one is followed back along it."""
+    labels, _ = carried_to(8, first=[seen(0)]).close([seen(8), seen(8, track_id=1)], frame=8)
+    new = [label for label in labels if label.track_id == 1]
+    assert [label.frame for label in new] == [4, 5, 6, 7]
+    for label in new:
+        assert np.abs(label.points[:, :2] - SCENE.truth(label.frame)).max() < 1.0
+
+
+def test_the_tracker_is_told_where_flow_went() -> None:
+    between = carried_to(6, first=[seen(0)])
+    boxes = between.carried(6)
+    assert set(boxes) == {0} and np.abs(boxes[0] - SCENE.label(6).box_xyxy).max() < 1.0
+    assert between.carried(7) == {}
+
+
+def test_boxes_end_at_the_border_and_what_left_is_not_shown() -> None:
+    outside = replace(seen(0), box_xyxy=np.array([-60.0, 70, 20, 142], np.float32))
+    partly = replace(seen(0, track_id=1), box_xyxy=np.array([-20.0, 70, 60, 142], np.float32))
+    labels, _ = carried_to(2, first=[outside, partly]).close([], frame=2)
+    assert {label.track_id for label in labels} == {1}
+    assert all(label.box_xyxy[0] >= 0 for label in labels)
