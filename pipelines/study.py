@@ -5,7 +5,7 @@ Every step leaves a record in the folder and is skipped when it is there: a stud
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +27,7 @@ from training.study_base import open_backbone, save_denoiser, save_vae
 from training.study_judge import PAIR_FRAMES, Judge, JudgeClip, Reading, is_counted, load_judge, train_judge
 from training.study_plan import ARMS, JUDGED_EVERY, QUESTIONS, Arm, StudyPlan, plan_study
 from training.study_scores import FIGURES, TrueTrack, clip_scores, true_tracks
-from training.study_verdicts import find, judge_gate, paired_interval, table_of
+from training.study_verdicts import SAME_SHARE, Gate, find, judge_gate, paired_interval, table_of
 
 HEADLINE = "keypoint_error"
 """The figure whose verdict answers a question; the others stand beside it."""
@@ -180,6 +180,7 @@ def prepare(study: Study) -> None:
     study.recorded("latents", lambda: _cache(study))
     study.recorded("judge", lambda: _teach_judge(study))
     study.recorded("truth", lambda: judge_truth(study))
+    study.recorded("another-street", lambda: judge_others(study))
     study.recorded("shipped", lambda: judge_shipped(study))
 
 
@@ -311,26 +312,18 @@ def _complete_seeds(study: Study) -> list[int]:
 def conclude(study: Study, *, seeds: Sequence[int]) -> dict[str, Any]:
     """Verdicts and all figures, as the tree of ``study.json``."""
     plan, keys = study.plan, study.keys
-    truth: dict[str, Scores] = study.recorded("truth", lambda: judge_truth(study))
+    truth: dict[str, Scores] = {
+        **study.recorded("truth", lambda: judge_truth(study)),
+        "another street": study.recorded("another-street", lambda: judge_others(study)),
+    }
     arms = {arm.name: [_clips(study, arm, seed) for seed in seeds] for arm in ARMS}
-    gates = {}
-    for figure in JUDGED_FIGURES:
-        unit, more = FIGURES[figure]
-        sides = [table_of([truth[name]], figure, keys)[0] for name in ("vae", "held")]
-        gates[figure] = judge_gate(figure, *sides, more_is_better=more, unit=unit)
+    gates, findings = _findings(study, truth, arms)
     questions = []
     for question in QUESTIONS:
-        findings = {}
-        for figure in JUDGED_FIGURES:
-            first, second = (table_of(arms[name], figure, keys) for name in (question.first, question.second))
-            copied, given = (table_of([truth[name]], figure, keys)[0] for name in ("held", "vae"))
-            finding = find(
-                first, second, gate=gates[figure], copied=copied, truth=given, more_is_better=FIGURES[figure][1]
-            )
-            findings[figure] = {**asdict(finding), "unit": FIGURES[figure][0]}
         apart = table_of(arms[question.first], "apd", keys) - table_of(arms[question.second], "apd", keys)
         questions.append(
-            {**asdict(question), "verdict": findings[HEADLINE]["verdict"], "figures": findings,
+            {**asdict(question), "verdict": findings[question.name][HEADLINE]["verdict"],
+             "figures": findings[question.name],
              "apd_difference_m": asdict(paired_interval(apart))}
         )  # fmt: skip
     rows = {name: _means(seeds, keys) for name, seeds in arms.items()}
@@ -342,6 +335,36 @@ def conclude(study: Study, *, seeds: Sequence[int]) -> dict[str, Any]:
         "processor_s": _spent(study), "machine": machine_name(), "threads": torch.get_num_threads(),
         "seeds": list(seeds),
     }  # fmt: skip
+
+
+def _findings(
+    study: Study, truth: Mapping[str, Scores], arms: Mapping[str, list[Scores]]
+) -> tuple[dict[str, Gate], dict[str, dict[str, Any]]]:
+    """The judge's gates by figure, and what each figure says of each question."""
+    gates: dict[str, Gate] = {}
+    findings: dict[str, dict[str, Any]] = {question.name: {} for question in QUESTIONS}
+    for figure in JUDGED_FIGURES:
+        unit, more = FIGURES[figure]
+        table = {name: table_of([scores], figure, study.keys)[0] for name, scores in truth.items()}
+        trivial = {"the first frame held": table["held"], "another street": table["another street"]}
+        # The truth is one sample: it stands beside what other streets are on average, not beside the best of six.
+        single = table_of([truth["another street"]], "ade" if figure == "min_ade" else figure, study.keys)[0]
+        gates[figure] = judge_gate(
+            figure, table["vae"], trivial | {"another street": single}, more_is_better=more, unit=unit
+        )
+        same = SAME_SHARE * float(np.nanmean(np.abs(table["vae"] - table["held"])))
+        for question in QUESTIONS:
+            sides = [table_of(arms[name], figure, study.keys) for name in (question.first, question.second)]
+            found = find(*sides, gate=gates[figure], trivial=trivial, same=same, more_is_better=more)
+            findings[question.name][figure] = {**asdict(found), "unit": unit}
+    return gates, findings
+
+
+def judge_others(study: Study) -> Scores:
+    """What the judge reads where every clip is answered by the truth of other streets: as good as any, but not this."""
+    given = through_vae(_vae(study, 1), study.stores[1], study.keys)
+    count = min(study.plan.scale.samples, len(study.keys) - 1)
+    return study.scores([np.roll(given, -turn, axis=0) for turn in range(1, count + 1)], frame_step=1)
 
 
 def _clips(study: Study, arm: Arm, seed: int) -> Scores:

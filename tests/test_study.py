@@ -142,22 +142,25 @@ def test_verdicts_follow_the_interval(gain, spread, verdict):
     rng = np.random.default_rng(0)
     second = rng.normal(4.0, 0.1, (3, 12))
     first = second - gain + rng.normal(0, spread, (3, 12))
-    found = find(
-        first, second, gate=HOLDS, copied=np.full(12, 9.0), truth=np.full(12, 1.0), more_is_better=False
-    )  # fmt: skip
+    trivial = {"the first frame held": np.full(12, 9.0)}
+    found = find(first, second, gate=HOLDS, trivial=trivial, same=0.8, more_is_better=False)
     assert found.verdict == verdict, found
 
 
 def test_no_verdict_without_a_judge_without_motion_or_with_two_seeds():
     truth, copied = np.full(12, 1.0), np.full(12, 6.0)
+    trivial = {"the first frame held": copied, "another street": copied + 1}
     good, bad = np.full((3, 12), 2.0), np.full((3, 12), 8.0)
-    fails = judge_gate("keypoint_error", copied + 0.1, copied, more_is_better=False, unit="px")
+    fails = judge_gate("keypoint_error", copied + 0.1, trivial, more_is_better=False, unit="px")
     assert not fails.holds
-    sides = {"copied": copied, "truth": truth, "more_is_better": False}
+    assert "not surely better than the first frame held" in fails.reason
+    sides = {"trivial": trivial, "same": 0.5, "more_is_better": False}
     assert "judge" in find(good, bad, gate=fails, **sides).reason
     assert "first frame" in find(bad, bad + 1, gate=HOLDS, **sides).reason
+    fooled = {**sides, "trivial": trivial | {"another street": truth}}
+    assert "another street" in find(good, bad, gate=HOLDS, **fooled).reason
     assert "2 of at least 3 seeds" in find(good[:2], bad[:2], gate=HOLDS, **sides).reason
-    holds = judge_gate("keypoint_error", truth, copied, more_is_better=False, unit="px")
+    holds = judge_gate("keypoint_error", truth, trivial, more_is_better=False, unit="px")
     assert holds.holds
     assert find(good, bad, gate=holds, **sides).verdict == "better"
 

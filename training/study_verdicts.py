@@ -16,7 +16,8 @@ from training.metrics import Interval
 Verdict = Literal["better", "worse", "no difference", "inconclusive"]
 LEAST_SEEDS = 3
 _DRAWS = 4000
-_SAME_SHARE = 0.1
+SAME_SHARE = 0.1
+"""Of what lies between the held first frame and the truth: less than this is no difference."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,42 +57,45 @@ def paired_interval(differences: np.ndarray, *, draws: int = _DRAWS, seed: int =
     return Interval(mean=float(table.mean()), low=float(low), high=float(high), groups=table.shape[1])
 
 
-def judge_gate(figure: str, truth: np.ndarray, copied: np.ndarray, *, more_is_better: bool, unit: str) -> Gate:
-    """Whether the judge tells the truth, through the VAE, from the first frame shown all the time.
+def judge_gate(
+    figure: str, truth: np.ndarray, trivial: Mapping[str, np.ndarray], *, more_is_better: bool, unit: str
+) -> Gate:
+    """Whether the judge tells the truth, through the VAE, from answers that need no model.
 
     Args:
         figure: its name.
         truth: (V,) of the truth's videos after the VAE.
-        copied: (V,) of the first frame, held.
+        trivial: (V,) by name: the first frame held, another street's video.
         more_is_better: of the figure.
         unit: for the reason.
     """
     sign = 1.0 if more_is_better else -1.0
-    gain = paired_interval(sign * (truth - copied)[None])
-    shown = f"{np.nanmean(truth):.2f} {unit} against {np.nanmean(copied):.2f} for the first frame held"
+    unsure = [name for name, values in trivial.items() if paired_interval(sign * (truth - values)[None]).low <= 0]
+    shown = ", ".join(f"{np.nanmean(values):.2f} for {name}" for name, values in trivial.items())
+    reason = f"on the truth through the VAE the judge reads {np.nanmean(truth):.2f} {unit}, against {shown}"
     return Gate(
-        figure=figure, holds=gain.low > 0,
-        reason=f"on the truth through the VAE the judge reads {shown}"
-        + ("" if gain.low > 0 else ", which is not surely better"),
+        figure=figure, holds=not unsure,
+        reason=reason + (f": not surely better than {' and '.join(unsure)}" if unsure else ""),
     )  # fmt: skip
 
 
 def find(
-    first: np.ndarray, second: np.ndarray, *, gate: Gate, copied: np.ndarray, truth: np.ndarray, more_is_better: bool
-) -> Finding:
+    first: np.ndarray, second: np.ndarray, *, gate: Gate, trivial: Mapping[str, np.ndarray], same: float,
+    more_is_better: bool,
+) -> Finding:  # fmt: skip
     """The verdict on one figure.
 
     Args:
         first: (S, V) the arm that the method prefers.
         second: (S, V) the other.
         gate: of the judge.
-        copied: (V,) the first frame held.
-        truth: (V,) the truth through the VAE.
+        trivial: (V,) by name: what an arm must surely beat to have learnt anything.
+        same: differences below this are none, in the figure's unit.
         more_is_better: of the figure.
 
     Returns:
-        ``inconclusive`` where the judge fails, where neither arm beats the first frame held, or where the interval is
-        wider than a tenth of what separates the held frame from the truth and holds 0.
+        ``inconclusive`` where the judge fails, with too few seeds, where neither arm beats the trivial answers, or
+        where the interval holds 0 and reaches beyond ``same``.
     """
     sign = 1.0 if more_is_better else -1.0
     difference = paired_interval(sign * (first - second))
@@ -100,11 +104,11 @@ def find(
     if len(first) < LEAST_SEEDS:
         reason = f"{len(first)} of at least {LEAST_SEEDS} seeds"
         return Finding(verdict="inconclusive", reason=reason, difference=difference)
-    gains = [paired_interval(sign * (arm - copied[None])) for arm in (first, second)]
-    if all(gain.low <= 0 for gain in gains):
-        reason = "neither arm surely beats showing the first frame all the time"
-        return Finding(verdict="inconclusive", reason=reason, difference=difference)
-    same = _SAME_SHARE * float(np.nanmean(np.abs(truth - copied)))
+    for name, values in trivial.items():
+        if all(paired_interval(sign * (arm - values[None])).low <= 0 for arm in (first, second)):
+            return Finding(
+                verdict="inconclusive", reason=f"neither arm surely beats {name}", difference=difference
+            )  # fmt: skip
     return Finding(**_read(difference, same), difference=difference)
 
 
