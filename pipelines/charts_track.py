@@ -34,7 +34,7 @@ from pipelines.keypoint_errors import match_frames
 from pipelines.track_errors import NO_TRACKS, TrackScore, jitter_px, lag_frames, point_series, track_score
 
 SCENARIOS: tuple[Scenario, ...] = ("crossing", "traffic", "turn", "sharp_turn", "stop_and_go")
-_FRAMES = 60
+_FRAMES = 48
 _SEED = HELD_OUT_SEED + 200
 _GREEDY_IOU = 0.3
 _LEAST_MS = 0.01
