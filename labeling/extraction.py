@@ -168,4 +168,8 @@ def _renumbered(channels: list[list[Keypoints]]) -> list[Keypoints]:
         key=lambda pair: (pair[0].frame, pair[1], pair[0].track_id),
     )
     ids: dict[tuple[int, int], int] = {}
-    return [replace(label, track_id=ids.setdefault((i, label.track_id), len(ids))) for label, i in ordered]
+    numbers = [ids.setdefault((i, label.track_id), len(ids)) for label, i in ordered]
+    return [
+        label if label.track_id == number else replace(label, track_id=number)
+        for (label, _), number in zip(ordered, numbers, strict=True)
+    ]

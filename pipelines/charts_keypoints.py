@@ -39,7 +39,7 @@ from pipelines.peers import RtmlibStreet
 from pipelines.track_errors import track_score
 
 SCENARIOS: tuple[Scenario, ...] = ("empty", "parked", "drive", "crossing", "traffic")
-_FRAMES = 48
+_FRAMES = 72
 _SEED = HELD_OUT_SEED + 100
 _DRAWS = 400
 _ALONE, _PEER = "every frame alone", "rtmlib, same files"

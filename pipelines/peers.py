@@ -34,7 +34,7 @@ class RtmlibStreet:
         self.heads: dict[Category, tuple[SimccCard, Callable[..., Any]]] = {
             card.category: (
                 card,
-                RTMPose(_weights(card), model_input_size=(card.input_width, card.input_height), backend="onnxruntime"),
+                _one_thread(partial(RTMPose, model_input_size=(card.input_width, card.input_height)), card),
             )
             for card in choice.heads
         }
