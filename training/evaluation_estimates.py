@@ -4,7 +4,8 @@ The same code looks at samples and at the truth's video (the noise floor), so th
 beside what the samples get wrong. Whatever fails is a fault with its reason.
 """
 
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from labeling.camera import Intrinsics, cover_map
 from labeling.ego_import import MISSING, motion_at, read_drive
 from labeling.ego_motion import EgoMotion, EgoSettings, RoadView, solve_run
 from labeling.ego_tracks import track_run
+from labeling.encoding import VideoWriter
 from labeling.errors import AnimaticError, DataError, TrajectoryError, VideoError
 from labeling.extraction import Effort, label_frames
 from labeling.extractors import Extractors
@@ -110,12 +112,16 @@ class ClipEstimator:
         return self._with_skeletons(found, files.skeleton) if files.skeleton else found
 
     def floor(self, like: SampleEstimate, *, skeleton_size: tuple[int, int] | None = None) -> SampleEstimate:
-        """The truth's own video at a sample's frame rate and size, and the truth's skeletons drawn and read back."""
+        """The truth's own video at a sample's frame rate and size, and the truth's skeletons drawn and read back.
+
+        It is encoded again, as a sample is: the very frames that were labelled would give the very labels back.
+        """
         times = like.times_s[like.times_s <= self.truth.times_s[-1] + 1e-6]
         indices = nearest_frames(self.truth.times_s, times)
         frames = [covered(self.pictures[index], width=like.width, height=like.height) for index in indices]
-        video = SampleVideo(frames=frames, times_s=times)
+        video = SampleVideo(frames=encoded_again(frames), times_s=times)
         found = self._with_ego(self._labelled("truth video", video), video)
+        found = self._with_pictures(found, video)
         if skeleton_size is None or self._car_schema is None:
             return found
         width, height = skeleton_size
@@ -237,6 +243,22 @@ def ego_fault(motion: EgoMotion) -> str | None:
     if sigma > MOST_SCALE_SIGMA:
         return f"metric scale unknown (sigma {sigma:.0%}): no road seen"
     return None
+
+
+def encoded_again(frames: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Frames (H, W, 3) as they come back from an MP4 that ``animatic generate`` would write; of odd sizes, as they are.
+
+    4:2:0 pictures have even sides.
+    """
+    height, width = frames[0].shape[:2]
+    if height % 2 or width % 2:
+        return list(frames)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "truth.mp4"
+        with VideoWriter(path, width=width, height=height, fps=24) as writer:
+            for frame in frames:
+                writer.write(np.ascontiguousarray(frame))
+        return list(read_frames(path))
 
 
 def imported_poses(path: Path, times_s: np.ndarray, *, intrinsics: Intrinsics) -> np.ndarray:

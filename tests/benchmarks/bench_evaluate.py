@@ -116,7 +116,7 @@ def main() -> None:
             found = evaluate(job, folder, EvaluateOptions())
             spent = time.process_time() - started
             if not number:
-                rows["truth's own video (floor)"] = {"exact_ade_m": 0.0, **row(found, FLOOR)}
+                rows["truth (floor)"] = {"exact_ade_m": 0.0, **row(found, FLOOR)}
             looked = 2 * len(clips) * CLIP * fps / 24  # the samples, and the floor at their rate and size
             rows[kind] = {
                 "exact_ade_m": round(float(np.mean([exact_ade(clip, kind) for clip in clips])), 4),
