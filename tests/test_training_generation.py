@@ -6,20 +6,32 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from training_fixtures import HEIGHT, PICTURE, WIDTH, FakeSample, one_thread, tiny_config, tiny_job  # noqa: F401
+from training_fixtures import (  # noqa: F401
+    HEIGHT,
+    PICTURE,
+    WIDTH,
+    FakeSample,
+    fake_datasets,
+    one_thread,
+    tiny_config,
+    tiny_job,
+    walker,
+)
 
 from labeling.camera import rotation_angle_deg, write_tum
 from labeling.errors import ConfigError, DataError, ModelError
+from labeling.labels import Keypoints
 from labeling.skeleton_video import draw_skeletons
 from labeling.video import frame_count, read_frames
 from training.backbone import SamplingSettings
 from training.backbones import load_backbone
 from training.clip_views import clip_trajectory
-from training.config import Stage, backbone_config
+from training.config import PictureConfig, Stage, backbone_config
 from training.ego_recipes import recipe_trajectory
-from training.generation import ClipConditions, ClipGenerator
+from training.generation import ClipConditions, ClipGenerator, prepare_conditions
 from training.generation import generate as generate_files
-from training.sampling_inputs import control_clip, ego_trajectory
+from training.latents import cache_latents
+from training.sampling_inputs import LABEL_WIDTH, control_clip, ego_trajectory, first_skeleton
 from training.trainer import TrainSummary, train
 
 SAMPLE = FakeSample(key="other_0")
@@ -200,3 +212,49 @@ def test_a_folder_that_cannot_be_written_to_is_a_storage_error(generator, tmp_pa
     clip = GeneratedClip(rgb=np.zeros((2, 64, 96, 3), np.uint8), control=None)
     with pytest.raises(StorageError):
         write_clip(clip, tmp_path / "file", "a", fps=24, seed=0, number=0)
+
+
+def test_the_first_skeleton_is_what_the_extractors_see(monkeypatch: pytest.MonkeyPatch) -> None:
+    from types import SimpleNamespace
+
+    from labeling import extractors, observation
+
+    shown: list[tuple[int, ...]] = []
+    scale = LABEL_WIDTH // WIDTH
+    label = walker(0, x=40)
+    # Pixel centres lie on integers.
+    label.points[:, :2] = (label.points[:, :2] + 0.5) * scale - 0.5
+
+    class Look:
+        def see(self, picture: np.ndarray, frame: int) -> list[Keypoints]:
+            shown.append(picture.shape)
+            return [label]
+
+    monkeypatch.setattr(extractors, "choose_extractors", lambda *_, **__: SimpleNamespace(cards=["one"]))
+    monkeypatch.setattr(extractors, "Extractors", lambda *_, **__: None)
+    monkeypatch.setattr(observation, "looks_of", lambda _: [Look()])
+    found = first_skeleton(IMAGE, picture=PictureConfig.model_validate(PICTURE))
+    assert shown == [(HEIGHT * scale, LABEL_WIDTH, 3)]
+    assert np.array_equal(
+        found, draw_skeletons([walker(0, x=40)], width=WIDTH, height=HEIGHT, label_width=WIDTH, label_height=HEIGHT)
+    )
+
+
+def test_another_intermediate_representation_goes_through_both_stages(tmp_path: Path) -> None:
+    cache_latents(
+        tmp_path, backbone_name="tiny", picture=PICTURE, controls=["segmentation"], datasets=fake_datasets(2, 0)
+    )
+    made: dict[Stage, Path] = {"motion": tmp_path / "m", "appearance": tmp_path / "a"}
+    for stage, out in made.items():
+        config = tiny_config(stage, conditions={"control": "segmentation"}, optimiser={"steps": 2})
+        train(config, data=tmp_path, out=out, quiet=True)
+    generator = ClipGenerator(
+        load_backbone(backbone_config("tiny", picture=PICTURE)), motion=made["motion"], appearance=made["appearance"]
+    )
+    assert generator.control_name("motion") == generator.control_name("appearance") == "segmentation"
+    first = SAMPLE.frames("segmentation.mp4")[0]
+    given = prepare_conditions(generator, image=IMAGE, caption="A road.", skeleton=first)
+    clip = generator.sample(given, settings=FAST)
+    assert clip.rgb is not None and clip.control is not None and clip.rgb.shape == clip.control.shape
+    with pytest.raises(ConfigError, match="first segmentation frame"):
+        prepare_conditions(generator, image=IMAGE, caption="A road.")

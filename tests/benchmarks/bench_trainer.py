@@ -10,6 +10,7 @@ stands beside it. The network is wide enough that a step takes 200 ms or more on
 
 import argparse
 import json
+import os
 import random
 import statistics
 import sys
@@ -187,8 +188,8 @@ def big_sample_ms(folder: Path) -> float:
     return max(costs.values())
 
 
-def waiting_percent(folder: Path, *, step_s: float = 0.2, steps: int = 40) -> float:
-    """Share of wall time that a step of ``step_s`` waits for two loader workers, at the real sizes, in percent."""
+def waiting_percent(folder: Path, *, step_s: float = 0.2, steps: int = 40) -> dict[str, float]:
+    """Share of wall time that steps of ``step_s`` wait for two loader workers, at the real sizes, in percent."""
     from torchdata.stateful_dataloader import StatefulDataLoader
 
     from training.latent_store import LatentStore
@@ -201,15 +202,19 @@ def waiting_percent(folder: Path, *, step_s: float = 0.2, steps: int = 40) -> fl
     loader = StatefulDataLoader(
         items, batch_sampler=StepBatches(8, config=config), collate_fn=collate, num_workers=2, prefetch_factor=4
     )
-    waited = 0.0
+    waits = []
     with Prefetched(loader) as batches:
-        for step in range(steps + 8):
+        for _ in range(steps + 8):
             began = time.perf_counter()
             next(batches)
-            # The first batches wait for the workers to start.
-            waited += time.perf_counter() - began if step >= 8 else 0.0
+            waits.append(time.perf_counter() - began)
             time.sleep(step_s)
-    return 100 * waited / (waited + steps * step_s)
+    # The first batches wait for the workers to start.
+    waits = waits[8:]
+    return {
+        "waiting_percent_of_200_ms_steps": 100 * sum(waits) / (sum(waits) + steps * step_s),
+        "waiting_percent_of_the_median_step": 100 * statistics.median(waits) / step_s,
+    }
 
 
 def checkpoint_cost(job: Path, folder: Path) -> dict[str, float]:
@@ -255,8 +260,8 @@ def measure(steps: int) -> dict[str, Any]:
             "overhead_percent_by_difference_95_interval": paired_interval(costs),
             "loader_ms_per_tiny_sample": loader_ms(job),
             "real_size_samples_per_second_per_worker": 1000 / big_sample_ms(folder),
-            "waiting_percent_of_200_ms_steps": waiting_percent(folder),
-        } | checkpoint_cost(job, folder / "checkpoint")  # fmt: skip
+            "load_average": os.getloadavg()[0],
+        } | waiting_percent(folder) | checkpoint_cost(job, folder / "checkpoint")  # fmt: skip
 
 
 if __name__ == "__main__":
