@@ -25,7 +25,7 @@ from training.street_models import evaluate
 from training.street_networks import FieldGraph, FieldNetwork, SimccGraph, SimccNetwork, StreetDetector
 from training.street_plans import plan_streets
 from training.street_pool import PICTURE_SIZE, ObjectTruth, PoolCrop, PoolFrame, StreetPool, render_pool
-from training.street_recipes import MODEL_NAMES, recipe
+from training.street_recipes import CAR_FIELDS, MODEL_NAMES, recipe
 from training.street_scores import distance_to_curve
 from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses, grid_cells
 
@@ -329,7 +329,7 @@ def test_the_pool_holds_what_the_street_shows() -> None:
         np.testing.assert_allclose(middle, (width / 2, height / 2), atol=1)
 
 
-@pytest.mark.parametrize("name", MODEL_NAMES)
+@pytest.mark.parametrize("name", [*MODEL_NAMES, CAR_FIELDS])
 def test_recipes_build_what_their_cards_say(name) -> None:
     plan = recipe(name)
     pictures = torch.zeros(1, 3, plan.card.input_height, plan.card.input_width)

@@ -25,7 +25,7 @@ from training.street_field_scores import judge_car_fields
 from training.street_fitting import fit
 from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, judging_frames, plan_streets
 from training.street_pool import StreetPool, render_pool
-from training.street_recipes import MODEL_NAMES, ModelName, Recipe, recipe
+from training.street_recipes import CAR_FIELDS, MODEL_NAMES, ModelName, Recipe, recipe
 from training.street_scores import StreetModels, Tally, judge_frame
 from training.street_thresholds import choose_thresholds
 
@@ -33,8 +33,6 @@ WORKERS = 2
 """Processes that render and train."""
 JUDGED_FRAMES = 6
 """Of each street that chooses thresholds or judges."""
-CAR_FIELDS: ModelName = "street_car24_fields"
-"""Cars bottom-up: an alternative to detector and head, judged beside them."""
 
 
 def train_model(plan: Recipe, pool: StreetPool, folder: Path, *, checkpoints: Path | None = None) -> ModelCard:
@@ -89,7 +87,6 @@ def evaluate(folder: Path, *, streets: int = 30, frames: int = JUDGED_FRAMES) ->
 def open_models(folder: Path) -> StreetModels:
     """Whichever street models ``folder`` has, but for the bottom-up cars."""
     cards = {name: read_card(folder / f"{name}.toml") for name in MODEL_NAMES if (folder / f"{name}.toml").is_file()}
-    cards.pop(CAR_FIELDS, None)
     detector, fields, heads = None, None, {}
     for card in cards.values():
         if isinstance(card, YoloxCard):
@@ -150,7 +147,7 @@ def train_all(options: argparse.Namespace) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train what is asked for, then judge it; ``--evaluate`` only judges."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="+", choices=MODEL_NAMES, default=MODEL_NAMES)
+    parser.add_argument("--only", nargs="+", choices=(*MODEL_NAMES, CAR_FIELDS), default=MODEL_NAMES)
     parser.add_argument("--evaluate", action="store_true", help="judge what is there, train nothing")
     parser.add_argument("--out", type=Path, default=SHIPPED_CARDS)
     parser.add_argument("--checkpoints", type=Path, help="folder from which a stopped run goes on")

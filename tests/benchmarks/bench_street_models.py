@@ -1,6 +1,5 @@
 """Time of the shipped street models on one core: one frame with 5 cars, 2 people and its lanes, through the labelling
-code. Processor time of this thread, medians of interleaved runs; the bound of the four that `street` opens is 60 ms.
-Bottom-up cars, which take the place of boxes where they are asked for, are timed beside them.
+code. Processor time of this thread, medians of interleaved runs; the bound of the four together is 60 ms.
 
     python tests/benchmarks/bench_street_models.py
 """
@@ -17,7 +16,7 @@ import numpy as np
 
 from dataset.street import Street, StreetConfig
 from labeling.model_cards import SHIPPED_CARDS
-from training.street_models import CAR_FIELDS, open_car_fields, open_models
+from training.street_models import open_models
 
 RUNS = 30
 CARS, PEOPLE = 5, 2
@@ -39,9 +38,6 @@ def main() -> None:
         "street_coco17": lambda: heads["person"].estimate([frame], [boxes["person"]]),
         "street_lane24": lambda: fields.estimate([frame]),
     }
-    cars = open_car_fields(SHIPPED_CARDS)
-    if cars is not None:
-        steps[CAR_FIELDS] = lambda: cars.estimate([frame])
     spent: dict[str, list[float]] = {name: [] for name in steps}
     for run in range(RUNS + 3):
         for name, step in steps.items():
@@ -50,12 +46,10 @@ def main() -> None:
             if run >= 3:
                 spent[name].append(1000 * (time.thread_time() - start))
     medians = {name: round(statistics.median(values), 2) for name, values in spent.items()}
-    bottom_up = medians.pop(CAR_FIELDS, None)
     result = {
         "machine": f"{platform.machine()}, one thread", "frame": "1056x704", "cars": CARS, "people": PEOPLE,
         "runs": RUNS,
         "ms_per_frame": medians, "total_ms": round(sum(medians.values()), 2), "bound_ms": 60.0,
-        "bottom_up_cars_ms": bottom_up,
     }  # fmt: skip
     RESULT.parent.mkdir(exist_ok=True)
     RESULT.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
