@@ -96,9 +96,10 @@ def exact_ade(clip: Sample, kind: str) -> float:
 
 
 def row(found: Evaluation, name: str) -> dict[str, float | None]:
-    """The figures that are shown."""
-    figures = found.report.sets[name].figures
-    return {figure: round(figures[figure].mean, 4) if figure in figures else None for figure in SHOWN}
+    """The figures that are shown, and in how many of the clips the camera's motion was found."""
+    summary = found.report.sets[name]
+    shown = {figure: round(summary.figures[figure].mean, 4) if figure in summary.figures else None for figure in SHOWN}
+    return {"ego_clips": summary.coverage["ego"].estimated, **shown}
 
 
 def main() -> None:
