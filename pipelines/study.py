@@ -380,7 +380,7 @@ def _means(seeds: Sequence[Scores], keys: Sequence[str]) -> dict[str, Any]:
 
 def _spent(study: Study) -> dict[str, float]:
     """Processor seconds by record, and in all."""
-    spent = {}
+    spent: dict[str, float] = {}
     for path in sorted((study.out / "records").glob("*.json")):
         spent[path.stem] = float(json.loads(path.read_text(encoding="utf-8"))["processor_s"])
     return spent | {"in all": round(sum(spent.values()), 1)}

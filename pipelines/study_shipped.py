@@ -86,11 +86,13 @@ def _detected(clip: StudyClip, video: np.ndarray) -> list[float]:
 def _read_back(clip: StudyClip, video: np.ndarray) -> list[float]:
     """The same for cars read back from the true skeletons, drawn at the study's size."""
     hits = []
-    size = {"label_width": clip.scale.label_width, "label_height": clip.scale.label_height}
+    wide, high = clip.scale.label_width, clip.scale.label_height
     for index in (0, len(video) - 1):
         labels: list[Keypoints] = clip.street.keypoints(clip.rendered[index])
-        drawn = draw_skeletons(labels, width=clip.scale.width, height=clip.scale.height, **size)
-        cars = skeletons_from_frame(drawn, schema="car24", **size)
+        drawn = draw_skeletons(
+            labels, width=clip.scale.width, height=clip.scale.height, label_width=wide, label_height=high
+        )
+        cars = skeletons_from_frame(drawn, schema="car24", label_width=wide, label_height=high)
         hits += _hits(clip, index, np.array([car.box_xyxy for car in cars]))
     return hits
 

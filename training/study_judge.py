@@ -1,4 +1,6 @@
-"""Who judges the study's little pictures: networks taught on street truth, since the extractors that label videos fail.
+"""Who judges the study's little pictures: networks taught on street truth, at this size and through this VAE.
+
+The extractors that label videos were made for pictures ten times as wide; the study reports what they make of these.
 
 A detector finds cars in single frames (the shipped street detector's network and loss, at twice the picture's size); a
 second network reads how the camera moved between two frames from how their features correlate. Both learn from the
