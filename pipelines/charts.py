@@ -166,7 +166,8 @@ def draw_chart(chart: Chart, path: Path) -> None:
         "line: Pareto front", transform=every_axes[0].transAxes, fontsize=8, color="#4a5568",
     )  # fmt: skip
     floor = f"; below {least:.2g} drawn at {least:.2g}" if least else ""
-    every_axes[-1].set_xlabel(f"cost, {cost_label(chart)} (median, log{floor})")
+    left_out = "".join(f"\nleft out: {line}" for line in chart.left_out)
+    every_axes[-1].set_xlabel(f"cost, {cost_label(chart)} (median, log{floor}){left_out}")
     figure.draw_without_rendering()
     for axes, points in zip(every_axes, panels, strict=True):
         _name_points(axes, points)
