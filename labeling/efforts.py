@@ -42,7 +42,7 @@ EFFORTS: dict[Effort, EffortSettings] = {
     "exact": EffortSettings(max_gap=1, max_person_gap=1, max_lane_gap=1, flow_step=0, quiet_gap=1),
     "balanced": EffortSettings(max_gap=8, max_person_gap=5, max_lane_gap=12, news_gap=4, flow_step=2, max_miss=0.04),
     "fast": EffortSettings(
-        max_gap=12, max_person_gap=10, max_lane_gap=12, news_gap=10, flow_step=4, max_bend=0.05, max_miss=0.08
+        max_gap=12, max_person_gap=10, max_lane_gap=12, news_gap=12, flow_step=4, max_bend=0.05, max_miss=0.08
     ),
 }
 
@@ -86,7 +86,7 @@ class Rhythm:
             return settings.quiet_gap if quiet else min(settings.max_gap, _WAITING_GAP)
         gap = 1.5 * self.gap + 1 if miss <= settings.max_miss else self.gap / 2
         old, new = ({label.track_id: label for label in labels} for labels in (before, seen))
-        if any(_height(new.get(i) or old[i]) >= _NEAR_PX for i in set(old) ^ set(new)):
+        if any(_is_near(new.get(i) or old[i]) for i in set(old) ^ set(new)):
             gap = min(gap, settings.news_gap)
         return min(gap, *(self._longest(label, old.get(label.track_id)) for label in seen))
 
@@ -107,5 +107,5 @@ def straight_gap(before: Keypoints, after: Keypoints, *, max_bend: float) -> flo
     return math.sqrt(4 * max_bend) / rate if rate > 0 else math.inf
 
 
-def _height(label: Keypoints) -> float:
-    return float(label.box_xyxy[3] - label.box_xyxy[1])
+def _is_near(label: Keypoints) -> bool:
+    return label.category != "lane" and label.box_xyxy[3] - label.box_xyxy[1] >= _NEAR_PX

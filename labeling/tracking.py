@@ -18,6 +18,11 @@ _UNMATCHED = 1.0
 parked cars would change places rather than leave one out."""
 
 
+_ROWS = np.linspace(0, 1, 12)
+_ROW_WEIGHTS = np.linspace(0.5, 1.5, 12) / 12
+"""Where two lines are compared, as shares of the rows that both cross, from the top, and what each row weighs."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackerSettings:
     """What makes two boxes the same object. Times are in frames of the 24 fps grid."""
@@ -257,7 +262,8 @@ class LaneTracker:
         ids = np.full(len(lines), UNTRACKED)
         known = sorted(self._lines)
         if known and len(lines):
-            cost = np.array([[line_distance(self._lines[i][0], line) for line in lines] for i in known])
+            before, now = [downwards(self._lines[i][0]) for i in known], [downwards(line) for line in lines]
+            cost = np.array([[_gap_px(a, b) for b in now] for a in before])
             rows, columns = linear_sum_assignment(np.minimum(cost, self.max_distance_px))
             for row, column in zip(rows, columns, strict=True):
                 if cost[row, column] <= self.max_distance_px:
@@ -281,20 +287,27 @@ def line_distance(line_a: np.ndarray, line_b: np.ndarray) -> float:
         line_a: (K, 3) x, y, score.
         line_b: (K, 3).
     """
-    ordered = []
-    for line in (line_a, line_b):
-        present = line[line[:, 2] > 0]
-        ordered.append(present[np.argsort(present[:, 1], kind="stable")])
-    if min(map(len, ordered)) < 2:
+    return _gap_px(downwards(line_a), downwards(line_b))
+
+
+def downwards(line: np.ndarray) -> np.ndarray:
+    """The present points of a line (K, 3), from the top of the picture down."""
+    present = line[line[:, 2] > 0]
+    return present[np.argsort(present[:, 1], kind="stable")]
+
+
+def _gap_px(line_a: np.ndarray, line_b: np.ndarray) -> float:
+    """``line_distance`` of lines that go downwards."""
+    if min(len(line_a), len(line_b)) < 2:
         return float("inf")
-    top = max(line[0, 1] for line in ordered)
-    bottom = min(line[-1, 1] for line in ordered)
+    top = max(line_a[0, 1], line_b[0, 1])
+    bottom = min(line_a[-1, 1], line_b[-1, 1])
     if bottom <= top:
         return float("inf")
-    rows = np.linspace(top, bottom, 12)
-    columns = [np.interp(rows, line[:, 1], line[:, 0]) for line in ordered]
+    rows = top + (bottom - top) * _ROWS
+    apart = np.abs(np.interp(rows, line_a[:, 1], line_a[:, 0]) - np.interp(rows, line_b[:, 1], line_b[:, 0]))
     # Lines fan out towards the camera: the lower rows tell them apart, the upper ones all meet.
-    return float(np.average(np.abs(columns[0] - columns[1]), weights=np.linspace(0.5, 1.5, 12)))
+    return float(apart @ _ROW_WEIGHTS)
 
 
 def iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from labeling.extraction import label_with
 from labeling.labels import Keypoints
 from labeling.observation import Look, looks_of
 from labeling.picture_turn import picture_turn, turn_view
+from labeling.schemas import Category
 from labeling.smoothing import smooth_tracks
 from labeling.tracking import RunTracker, TrackerSettings, iou
 from pipelines.charts import Chart, ChartPoint, Cost, Error, machine_name
@@ -31,10 +32,12 @@ from pipelines.keypoint_clips import (
     street_frames,
 )
 from pipelines.keypoint_errors import match_frames
-from pipelines.track_errors import NO_TRACKS, TrackScore, jitter_px, lag_frames, point_series, track_score
+from pipelines.track_errors import NO_TRACKS, PointSeries, TrackScore, jitter_px, lag_frames, point_series, track_score
 
-SCENARIOS: tuple[Scenario, ...] = ("crossing", "traffic", "turn", "sharp_turn", "stop_and_go")
+SCENARIOS: tuple[Scenario, ...] = ("crossing", "traffic", "turn", "sharp_turn", "stop_and_go", "parked")
 _FRAMES = 48
+_STARTS: dict[Scenario, int] = {"stop_and_go": 24}
+"""Frames to skip: everybody brakes from the second second on."""
 _SEED = HELD_OUT_SEED + 200
 _GREEDY_IOU = 0.3
 _LEAST_MS = 0.01
@@ -97,7 +100,10 @@ def track_clips(*, quick: bool = False) -> list[TrackClip]:
     """The streets with what the shipped models see in every frame."""
     if quick:
         return [look_at(street_frames("crossing", _SEED, 13, width=WIDTH // 2, height=HEIGHT // 2))]
-    return [look_at(street_frames(scenario, _SEED + n, _FRAMES)) for n, scenario in enumerate(SCENARIOS)]
+    return [
+        look_at(street_frames(scenario, _SEED + n, _FRAMES, start=_STARTS.get(scenario, 0)))
+        for n, scenario in enumerate(SCENARIOS)
+    ]
 
 
 def look_at(clip: KeypointClip) -> TrackClip:
@@ -180,19 +186,18 @@ METHODS: dict[str, Method] = {
 def _point(method: str, found: list[list[Keypoints]], clips: Sequence[TrackClip], spent: list[float]) -> ChartPoint:
     scores = [track_score(labels, clip.clip.truth) for labels, clip in zip(found, clips, strict=True)]
     total = sum(scores, NO_TRACKS)
-    series = [
-        one
-        for labels, clip in zip(found, clips, strict=True)
-        for one in point_series(match_frames(labels, clip.clip.truth))
-    ]
-    shaking = [
-        jitter_px(point_series(match_frames(labels, clip.clip.truth)))
-        for labels, clip in zip(found, clips, strict=True)
-    ]
-    lag = lag_frames([one for one in series if one.category == "person"], points=_LEG_POINTS)
+    by_clip = [point_series(match_frames(labels, one.clip.truth)) for labels, one in zip(found, clips, strict=True)]
+    series = [one for part in by_clip for one in part]
+    shaking = [jitter_px(part) for part in by_clip]
+    by_name = {clip.clip.name: part for clip, part in zip(clips, by_clip, strict=True)}
     settings = {
         clip.clip.name: _figures(score) for score, clip in zip(scores, clips, strict=True)
-    } | {"all": _figures(total), "lag_of_legs_frames": _rounded(lag)}  # fmt: skip
+    } | {
+        "all": _figures(total),
+        "lag_of_legs_frames": _rounded(lag_frames(_of("person", series), points=_LEG_POINTS)),
+        "lag_of_braking_cars_frames": _rounded(lag_frames(_of("car", by_name.get("stop_and_go", [])))),
+        "jitter_of_parked_cars_px": _rounded(jitter_px(by_name.get("parked", []))),
+    }  # fmt: skip
     return ChartPoint(
         method=method, settings=settings, reference=method == "no ids",
         ms_per_frame=Cost(median=float(np.median(spent)), p95=float(np.percentile(spent, 95)), runs=len(spent)),
@@ -207,6 +212,10 @@ def _point(method: str, found: list[list[Keypoints]], clips: Sequence[TrackClip]
             ),
         ),
     )  # fmt: skip
+
+
+def _of(category: Category, series: Sequence[PointSeries]) -> list[PointSeries]:
+    return [one for one in series if one.category == category]
 
 
 def _figures(score: TrackScore) -> dict[str, float | None]:
