@@ -21,8 +21,8 @@ from pipelines.keypoint_clips import KeypointClip
 class RtmlibStreet:
     """rtmlib (Apache-2.0) with the street's detector and heads: every frame alone, no lanes.
 
-    Its own defaults are set to the cards' (thresholds, input size), and it is given the channel order that each card
-    asks for; see ``tests/test_parity_rtmlib.py`` for where it departs from us.
+    Its own defaults are set to the cards' (input size, thresholds, of which it knows one for all classes), and it is
+    given the channel order that each card asks for; see ``tests/test_parity_rtmlib.py`` for where it departs from us.
     """
 
     def __init__(self, choice: ExtractorChoice) -> None:
