@@ -42,7 +42,7 @@ SCENARIOS: tuple[Scenario, ...] = ("empty", "parked", "drive", "crossing", "traf
 _FRAMES = 72
 _SEED = HELD_OUT_SEED + 100
 _DRAWS = 400
-_ALONE, _PEER = "every frame alone", "rtmlib, same files"
+_ALONE, _PEER = "every frame alone", "rtmlib (no lanes)"
 _STRIDES = {_ALONE: 3, _PEER: 3}
 """Methods that know no other frame are measured on every third one: the same figures in a third of the time."""
 
