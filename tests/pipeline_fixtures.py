@@ -34,14 +34,16 @@ def small_config(**changes: object) -> Config:
     return merged(merged(Config(), SMALL), changes)
 
 
-def write_street(path: Path, *, frames: int = 48, level: int = 90, seed: int = 0, fps: int = 24) -> Path:
-    """A camera that slides over a noise texture; ``level`` is the mean grey value."""
+def write_street(
+    path: Path, *, frames: int = 48, level: int = 90, seed: int = 0, fps: int = 24, slide: int = 2
+) -> Path:
+    """A camera that slides over a noise texture by ``slide`` pixels a frame; ``level`` is the mean grey value."""
     texture = np.random.default_rng(seed).integers(-60, 60, (HEIGHT // 4, WIDTH, 1)).repeat(4, 0).repeat(4, 1)
     settings = EncoderSettings(gop=12, preset="ultrafast")
     path.parent.mkdir(parents=True, exist_ok=True)
     with VideoWriter(path, width=WIDTH, height=HEIGHT, fps=fps, settings=settings) as writer:
         for index in range(frames):
-            window = texture[:, 2 * index % WIDTH :][:, :WIDTH]
+            window = texture[:, slide * index % WIDTH :][:, :WIDTH]
             picture = np.concatenate([window, texture], axis=1)[:, :WIDTH]
             writer.write(np.clip(np.repeat(picture, 3, axis=2) + level, 0, 255).astype(np.uint8))
     return path

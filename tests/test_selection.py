@@ -149,7 +149,7 @@ def test_a_selection_is_read_back_as_it_was_written(tmp_path):
     selection = select(VIDEOS, SelectionRule(sample_clips=5))
     write_selection(tmp_path / "s.parquet", selection)
     assert read_selection(tmp_path / "s.parquet") == selection
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="is not there"):
         read_selection(tmp_path / "none.parquet")
 
 
