@@ -126,7 +126,7 @@ def stock_opencv(clip: EgoClip, *, method: int = cv2.RANSAC, distance_limit: flo
 
 def orb_matching(clip: EgoClip) -> np.ndarray:
     """ORB features matched by brute force, then ``findEssentialMat`` and ``recoverPose`` without the limit."""
-    orb, matcher = cv2.ORB_create(nfeatures=800), cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+    orb, matcher = cv2.ORB.create(nfeatures=800), cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
     camera = clip.intrinsics
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     rotation, axis = np.eye(3), FORWARD
