@@ -74,7 +74,7 @@ def _frames(trajectory: Trajectory, camera: Intrinsics, seed: int) -> Iterator[n
     plotter = pyvista.Plotter(off_screen=True, window_size=[camera.width, camera.height], lighting="none")
     try:
         plotter.enable_anti_aliasing("msaa", multi_samples=_SAMPLES)
-        plotter.set_background("black")
+        plotter.background_color = "black"  # pyright: ignore[reportAttributeAccessIssue]
         plotter.add_mesh(_sphere_mesh(), texture=_texture(world_raster(camera)), lighting=False)
         _set_lens(plotter.camera, camera)
         for motion in trajectory.cam_to_world:
