@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dataset.street_cars import CAR_COLOURS, CAR_SHAPES, CarShape
+from dataset.street_car_sizes import CAR_COLOURS, CAR_SHAPES, CarShape
 from dataset.street_drives import Drive
 from dataset.street_people import PersonLook, random_look
 from dataset.street_scene import StreetPlan

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from dataset.street import SCENARIOS, Scenario, Street, StreetConfig, write_street_video
-from dataset.street_cars import CAR_SHAPES, car_model, hidden_by_itself
+from dataset.street_car_sizes import CAR_SHAPES
+from dataset.street_cars import car_model, hidden_by_itself
 from dataset.street_labels import project
 from labeling.camera import invert, read_tum, resample, rotation_angle_deg
 from labeling.errors import ConfigError
