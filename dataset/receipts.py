@@ -23,7 +23,6 @@ State = Literal["done", "dropped", "failed"]
 
 _STORAGE_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.ENOTDIR, errno.EACCES, errno.EPERM,
                    errno.EIO, errno.ESTALE, errno.ENAMETOOLONG, errno.EEXIST, errno.EISDIR}  # fmt: skip
-_HASH_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -246,15 +246,6 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return values
 
 
-def read_config(path: Path) -> Config:
-    """The configuration in a YAML file.
-
-    Raises:
-        ConfigError: as ``read_yaml`` and ``parse_config``.
-    """
-    return parse_config(read_yaml(path), str(path))
-
-
 def _deep_merge(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     result = dict(values)
     for name, change in changes.items():

@@ -1,6 +1,5 @@
 """What a person sees: a progress bar per stage, one line for each failure, and numbers in readable units."""
 
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -125,8 +124,3 @@ def file_size(size: float) -> str:
             return f"{size:.0f} {unit}" if unit == "B" else f"{size:.3g} {unit}"
         size /= 1000
     return f"{size:.3g} TB"
-
-
-def is_interactive() -> bool:
-    """Whether a person looks at standard output."""
-    return sys.stdout.isatty()

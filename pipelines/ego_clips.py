@@ -90,37 +90,21 @@ def highway_clip(*, frames: int = 24 * SECONDS, start_s: float = 20.0) -> EgoCli
     return _rendered(config, "highway")
 
 
-def _rendered(config: StreetConfig, name: str) -> EgoClip:
+def _rendered(config: StreetConfig, name: str, *, start: int = 0) -> EgoClip:
     street = Street(config)
     return EgoClip(
-        name=name, frames=[street.render(index).rgb for index in range(config.frames)],
-        times_s=np.arange(config.frames) / config.fps, intrinsics=street.intrinsics,
-        truth=street.trajectory.cam_to_world, camera_height_m=config.camera_height_m,
+        name=name, frames=[street.render(index).rgb for index in range(start, config.frames)],
+        times_s=np.arange(config.frames - start) / config.fps, intrinsics=street.intrinsics,
+        truth=street.trajectory.cam_to_world[start:], camera_height_m=config.camera_height_m,
     )  # fmt: skip
 
 
-def rolling_clip(*, start: int = 36, frames: int = 40, readout_s: float = 0.03, bands: int = 6) -> EgoClip:
-    """The middle of a sharp turn through a rolling shutter: each frame's rows in bands, each band at its own time.
+def rolling_clip(*, start: int = 36, frames: int = 40, readout_s: float = 0.03) -> EgoClip:
+    """The middle of a sharp turn through a rolling shutter.
 
     It starts where the turn is well under way: while a turn begins, half a readout is a share of the yaw so far.
     """
-    fine = 16
-    street = Street(
-        StreetConfig(
-            seed=1, width=WIDTH, height=HEIGHT, frames=(start + frames + 1) * fine, scenario="sharp_turn",
-            fps=24.0 * fine,
-        )
-    )  # fmt: skip
-    pictures = []
-    for index in range(start, start + frames):
-        picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-        for band in range(bands):
-            late = round((band + 0.5) / bands * readout_s * 24 * fine)
-            rows = slice(band * HEIGHT // bands, (band + 1) * HEIGHT // bands)
-            picture[rows] = street.render(index * fine + late).rgb[rows]
-        pictures.append(picture)
-    middle = start * fine + round(0.5 * readout_s * 24 * fine)
-    return EgoClip(
-        name="rolling shutter", frames=pictures, times_s=np.arange(frames) / 24, intrinsics=street.intrinsics,
-        truth=street.trajectory.cam_to_world[middle::fine][:frames],
-    )  # fmt: skip
+    config = StreetConfig(
+        seed=1, width=WIDTH, height=HEIGHT, frames=start + frames, scenario="sharp_turn", rolling_shutter_s=readout_s
+    )
+    return _rendered(config, "rolling shutter", start=start)

@@ -1,6 +1,5 @@
 """The study's street clips: small pictures, few frames, exact truth; each is drawn when it is first asked for."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
@@ -155,8 +154,3 @@ def _renumbered(label: Keypoints, frame: int) -> Keypoints:
     from dataclasses import replace
 
     return replace(label, frame=frame)
-
-
-def car_boxes(frames: Sequence[Sequence[StreetObject]]) -> list[np.ndarray]:
-    """(n, 4) boxes of each frame."""
-    return [np.array([thing.box_xyxy for thing in things], np.float32).reshape(-1, 4) for things in frames]
