@@ -33,6 +33,7 @@ class BetweenLooks:
     _paths: dict[int, list[Keypoints]] = field(default_factory=dict)
     _trail: list[tuple[np.ndarray, int]] = field(default_factory=list)
     _followed: set[int] = field(default_factory=set)
+    _held: dict[int, int] = field(default_factory=dict)
     _slippery: set[int] = field(default_factory=set)
 
     def start(self, seen: list[Keypoints], *, frame: int, grey: np.ndarray | None) -> None:
@@ -41,6 +42,7 @@ class BetweenLooks:
         self._paths = {label.track_id: [label] for label in seen}
         self._trail = [] if grey is None else [(grey, frame)]
         self._followed = set(self._paths)
+        self._held = dict.fromkeys(self._paths, frame)
 
     def due(self, frame: int) -> bool:
         """Whether flow takes a step at ``frame``."""
@@ -61,6 +63,7 @@ class BetweenLooks:
             if not moved.followed and not _at_border(moved.label.box_xyxy, self._size)
         }  # fmt: skip
         self._followed -= {moved.label.track_id for moved in carried if not moved.followed}
+        self._held |= dict.fromkeys(self._followed, frame)
         # Flow that loses what the next look finds again has nothing to hold on to there: it asks for no second look.
         new = lost - self._slippery
         self._slippery |= lost
@@ -88,7 +91,9 @@ class BetweenLooks:
         for label in self.seen:
             path, end = self._paths[label.track_id], now.get(label.track_id)
             if end is None:
-                labels += [step for step in along_path(path) if step.frame < min(frame, label.frame + self._shown + 1)]
+                # Flow that lost it saw what now stands before it: there is nothing to show any more.
+                last = min(frame - 1, label.frame + self._shown, self._held[label.track_id])
+                labels += [step for step in along_path(path) if step.frame <= last]
             elif len(path) > 1 and path[-1].frame == frame:
                 misses.append(_miss(path[-1], end))
                 labels += close_gap(path, end)

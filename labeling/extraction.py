@@ -3,12 +3,16 @@
 The networks are nearly all the cost. With ``exact`` they see every frame; with the other efforts they see some, and
 between these the points of cars and people are carried by optical flow, and lanes, which have no points of their own to
 follow, by straight lines. How often they look is ``efforts``'; what is shown in between is ``between_looks``'.
+
+A picture that is shown again is the same moment: nothing moves, nothing is looked at, and what follows it does not
+start from rest. Everything here therefore counts moments, and tells frames only at its ends.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 
 from labeling.between_looks import BetweenLooks
@@ -24,6 +28,8 @@ from labeling.tracking import RunTracker, TrackerSettings, drop_passing_tracks
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
 """What lasts less than a quarter of a second, or was seen once, is taken for a mistake."""
+_SAMPLE, _SAME_LEVELS = 16, 2
+"""Every so many pixels are compared before all are; and by how many levels they may differ."""
 _TURN_STEP = 4
 """Frames after which two pictures of a camera that turns sharply have too little in common."""
 
@@ -66,15 +72,47 @@ def label_with(
     """As ``label_frames``, for anything that looks at a frame and tells what it sees."""
     settings = effort if isinstance(effort, EffortSettings) else EFFORTS[effort]
     channels = [_Channel(look, settings) for look in looks]
+    moments: list[int] = []
+    shown: list[int] = []
+    latest = None
     for number, frame in enumerate(frames, start=first_frame):
-        views = _Views(frame)
-        for channel in channels:
-            channel.push(views, number=number, fresh=number in breaks)
+        if latest is None or number in breaks or not same_picture(latest, frame):
+            views, latest = _Views(frame), frame
+            for channel in channels:
+                channel.push(views, number=len(moments), fresh=number in breaks)
+            moments.append(number)
+        shown.append(len(moments) - 1)
     for channel in channels:
         channel.finish()
     labels = _renumbered([channel.labels for channel in channels])
     labels = drop_passing_tracks(labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES)
-    return smooth_tracks(labels, breaks=breaks)
+    fresh = frozenset(moment for moment, number in enumerate(moments) if number in breaks)
+    return _on_grid(smooth_tracks(labels, breaks=fresh), shown, first_frame=first_frame)
+
+
+def same_picture(picture: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two (H, W, 3) uint8 frames show the same moment: a camera that froze, or a source of fewer frames.
+
+    Coding again may move a level or two; a camera's own noise moves more.
+    """
+    if picture.shape != other.shape:
+        return False
+    few, others = (one[::_SAMPLE, ::_SAMPLE] for one in (picture, other))
+    if cv2.norm(np.ascontiguousarray(few), np.ascontiguousarray(others), cv2.NORM_INF) > _SAME_LEVELS:
+        return False
+    return cv2.norm(picture, other, cv2.NORM_INF) <= _SAME_LEVELS
+
+
+def _on_grid(labels: Sequence[Keypoints], shown: Sequence[int], *, first_frame: int) -> list[Keypoints]:
+    """Labels of moments for every frame that shows them; ``shown`` has the moment of each frame."""
+    by_moment: dict[int, list[Keypoints]] = {}
+    for label in labels:
+        by_moment.setdefault(label.frame, []).append(label)
+    return [
+        replace(label, frame=number)
+        for number, moment in enumerate(shown, start=first_frame)
+        for label in by_moment.get(moment, [])
+    ]
 
 
 class _Views:

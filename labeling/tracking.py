@@ -23,6 +23,10 @@ _ROW_WEIGHTS = np.linspace(0.5, 1.5, 12) / 12
 """Where two lines are compared, as shares of the rows that both cross, from the top, and what each row weighs."""
 
 
+_FORGET_SIZE = 0.01
+"""Share of its full size that an object may lose per frame: what drives away gets smaller too, but slowly."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackerSettings:
     """What makes two boxes the same object. Times are in frames of the 24 fps grid."""
@@ -33,10 +37,13 @@ class TrackerSettings:
     """Boxes grow by this share of their size on each side before they are compared."""
     lost_buffer: float = 0.6
     """The same for tracks that have not been seen for a while: their prediction is less sure."""
+    lost_cost: float = 0.1
+    """Added to what it costs to match a lost track: between equals, the one that was just seen goes first."""
     min_overlap: float = 0.15
     """Least IoU of the buffered boxes."""
-    max_lost_frames: int = 30
-    """An object that was hidden for longer comes back as a new one: one second, and a little for its borders."""
+    max_lost_frames: int = 36
+    """An object that was hidden for longer comes back as a new one: one second, and as long for both its borders to
+    pass."""
     max_size_ratio: float = 1.9
     """A box may not be that much larger or smaller than its prediction (its height, whichever way)."""
 
@@ -48,6 +55,8 @@ class _Track:
     """(4, 2): centre x, centre y, log width, log height, each with its change per frame."""
     covariance: np.ndarray
     """(4, 2, 2)."""
+    full_size: np.ndarray
+    """(2,) log width and height of the whole object, as far as it was seen."""
     lost_frames: int
 
     @property
@@ -105,27 +114,33 @@ class BoxTracker:
         high = np.flatnonzero(scores >= self.settings.high_score)
         low = np.flatnonzero(scores < self.settings.high_score)
         seen = [track for track in self._tracks if track.lost_frames <= frame_step]
-        lost = [track for track in self._tracks if track.lost_frames > frame_step]
-        high = self._associate(seen, boxes, ids, high, buffer=self.settings.buffer)
-        high = self._associate(lost, boxes, ids, high, buffer=self.settings.lost_buffer)
+        # Lost ones have a say too: where one person goes behind a column another may just come out.
+        high = self._associate(self._tracks, boxes, ids, high, frame_step)
         unmatched = [track for track in seen if track.lost_frames]
-        self._associate(unmatched, boxes, ids, low, buffer=self.settings.buffer)
+        self._associate(unmatched, boxes, ids, low, frame_step)
         for index in high:
             ids[index] = self._start(boxes[index])
         self._tracks = [track for track in self._tracks if track.lost_frames <= self.settings.max_lost_frames]
         return ids
 
     def _associate(
-        self, tracks: list[_Track], boxes: np.ndarray, ids: np.ndarray, chosen: np.ndarray, *, buffer: float
+        self, tracks: list[_Track], boxes: np.ndarray, ids: np.ndarray, chosen: np.ndarray, frame_step: int
     ) -> np.ndarray:
         """Match ``chosen`` boxes to tracks, update both; returns the boxes that found none."""
         if not tracks or not len(chosen):
             return chosen
         predicted = np.stack([track.box_xyxy for track in tracks])
-        overlap = iou(_grown(predicted, buffer), _grown(boxes[chosen], buffer))
+        lost = np.array([track.lost_frames > frame_step for track in tracks])[:, None]
+        settings = self.settings
+        near, far = (
+            iou(_grown(predicted, buffer), _grown(boxes[chosen], buffer))
+            for buffer in (settings.buffer, settings.lost_buffer)
+        )
+        overlap = np.where(lost, far, near)
         heights = np.log(_heights(boxes[chosen])[None] / _heights(predicted)[:, None])
-        allowed = (overlap >= self.settings.min_overlap) & (np.abs(heights) <= np.log(self.settings.max_size_ratio))
-        rows, columns = linear_sum_assignment(np.where(allowed, 1 - overlap, _UNMATCHED))
+        allowed = (overlap >= settings.min_overlap) & (np.abs(heights) <= np.log(settings.max_size_ratio))
+        cost = np.minimum(1 - overlap + settings.lost_cost * lost, _UNMATCHED)
+        rows, columns = linear_sum_assignment(np.where(allowed, cost, _UNMATCHED))
         taken = np.zeros(len(chosen), bool)
         for row, column in zip(rows, columns, strict=True):
             if allowed[row, column]:
@@ -141,7 +156,11 @@ class BoxTracker:
         spread = np.array([_size_px(box_xyxy) * 0.1, _size_px(box_xyxy) * 0.1, 0.1, 0.1])
         covariance = np.zeros((4, 2, 2))
         covariance[:, 0, 0], covariance[:, 1, 1] = spread**2, spread**2
-        self._tracks.append(_Track(track_id=self.next_id, mean=mean, covariance=covariance, lost_frames=0))
+        self._tracks.append(
+            _Track(
+                track_id=self.next_id, mean=mean, covariance=covariance, full_size=mean[2:, 0].copy(), lost_frames=0
+            )
+        )  # fmt: skip
         self.next_id += 1
         return self.next_id - 1
 
@@ -363,11 +382,18 @@ def _predict(track: _Track, steps: int) -> None:
     noise = np.array([[steps**3 / 3, steps**2 / 2], [steps**2 / 2, steps]])
     track.covariance = transition @ track.covariance @ transition.T + strength[:, None, None] * noise
     track.lost_frames += steps
+    track.full_size = track.full_size - _FORGET_SIZE * steps
 
 
 def _correct(track: _Track, box_xyxy: np.ndarray) -> None:
-    sigma = np.array([0.03 * _size_px(box_xyxy), 0.03 * _size_px(box_xyxy), 0.04, 0.04])
-    innovation = _measurement(box_xyxy) - track.mean[:, 0]
+    measured, predicted = _measurement(box_xyxy), track.mean[:, 0]
+    # A box that is smaller than the object may be what a column leaves in view of it. All that is known then is that
+    # the whole contains it: were its middle believed, the object would seem to stop at the column's edge.
+    track.full_size = np.maximum(measured[2:], track.full_size)
+    reach = (np.exp(track.full_size) - np.exp(measured[2:])) / 2
+    centre = np.clip(predicted[:2], measured[:2] - reach, measured[:2] + reach)
+    innovation = np.concatenate([centre, measured[2:]]) - predicted
+    sigma = np.concatenate([np.full(2, 0.03 * _size_px(box_xyxy)), np.hypot(0.04, track.full_size - measured[2:])])
     gain = track.covariance[:, :, 0] / (track.covariance[:, 0, 0] + sigma**2)[:, None]
     track.mean = track.mean + gain * innovation[:, None]
     track.covariance = track.covariance - gain[:, :, None] * track.covariance[:, :1, :]

@@ -158,7 +158,7 @@ def test_a_track_is_where_flow_took_it() -> None:
 def test_flow_alone_keeps_no_track_alive() -> None:
     tracker = BoxTracker()
     tracker.update(box(300)[None], np.ones(1))
-    for _ in range(4):
+    for _ in range(5):
         tracker.update(np.zeros((0, 4)), np.zeros(0), frame_step=8, carried={0: box(300)})
     assert not tracker.following
 
