@@ -85,9 +85,9 @@ def label_with(
     for channel in channels:
         channel.finish()
     labels = _renumbered([channel.labels for channel in channels])
-    labels = drop_passing_tracks(labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES)
     fresh = frozenset(moment for moment, number in enumerate(moments) if number in breaks)
-    return _on_grid(smooth_tracks(labels, breaks=fresh), shown, first_frame=first_frame)
+    labels = _on_grid(smooth_tracks(labels, breaks=fresh), shown, first_frame=first_frame)
+    return drop_passing_tracks(labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES)
 
 
 def same_picture(picture: np.ndarray, other: np.ndarray) -> bool:

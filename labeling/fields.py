@@ -3,7 +3,7 @@
 PifPaf, Kreiss, Bertoni, Alahi 2019, and OpenPifPaf, the same 2021. Written from the papers: no code of it is used.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -13,7 +13,7 @@ from labeling import field_growth as growth
 from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
 from labeling.model_cards import CifcafCard, FieldHeadCard
 from labeling.onnx_model import DEFAULT_PROVIDERS, OnnxModel, check_frame, network_input
-from labeling.schemas import keypoint_schema
+from labeling.schemas import CATEGORIES, Category, keypoint_schema
 
 _BEST_POINTS, _BEST_WEIGHT = 3, 3.0
 """An object's score is the mean over all K points, the three best counted three times (PifPaf)."""
@@ -106,29 +106,38 @@ class FieldModel:
         """Schemas of the objects that ``estimate`` gives."""
         return tuple(head.schema_name for head in self.card.heads)
 
-    def estimate(self, frames: Sequence[np.ndarray], *, first_frame: int = 0) -> list[list[Keypoints]]:
+    def estimate(
+        self, frames: Sequence[np.ndarray], *, first_frame: int = 0, categories: Collection[Category] = CATEGORIES
+    ) -> list[list[Keypoints]]:
         """Untracked objects of each frame, in frame pixels; frame *i* of the list is numbered ``first_frame + i``.
 
         Args:
             frames: (H, W, 3) uint8 RGB; scaled to fit where they are not of the network's size.
             first_frame: number of the first on the video's 24 fps grid.
+            categories: what is wanted: fields of others are not decoded.
 
         Raises:
             ModelError: a frame that is no RGB picture, or a network's output that is not finite.
         """
+        wanted = [n for n, name in enumerate(self.schema_names) if keypoint_schema(name).category in categories]
+        outputs = [2 * n + side for n in wanted for side in (0, 1)]
         found: list[list[Keypoints]] = []
         for start in range(0, len(frames), self.model.max_batch):
             pictures = [padded_input(frame, self.card) for frame in frames[start : start + self.model.max_batch]]
-            outputs = self.model.run(np.stack([picture for picture, _ in pictures]))
+            fields = self.model.run(np.stack([picture for picture, _ in pictures]), outputs=outputs)
             for i, (_, ratio) in enumerate(pictures):
-                fields = [output[i] for output in outputs]
-                found.append(self._objects(fields, ratio=ratio, frame=first_frame + start + i))
+                pairs = {n: (fields[2 * k][i], fields[2 * k + 1][i]) for k, n in enumerate(wanted)}
+                found.append(self._objects(pairs, ratio=ratio, frame=first_frame + start + i))
         return found
 
-    def _objects(self, fields: Sequence[np.ndarray], *, ratio: float, frame: int) -> list[Keypoints]:
+    def _objects(
+        self, pairs: Mapping[int, tuple[np.ndarray, np.ndarray]], *, ratio: float, frame: int
+    ) -> list[Keypoints]:
+        """Objects of one frame from the pairs of fields of some decoders, by their places."""
         objects = []
-        for n, decoder in enumerate(self.decoders):
-            for points, score in decoder.decode(fields[2 * n], fields[2 * n + 1]):
+        for n, (cif, caf) in pairs.items():
+            decoder = self.decoders[n]
+            for points, score in decoder.decode(cif, caf):
                 # Pixel centres lie on integers in both pictures.
                 present = points[:, 2] > 0
                 points[present, :2] = (points[present, :2] + 0.5) / ratio - 0.5

@@ -100,5 +100,5 @@ class FieldLook:
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""
-        (objects,) = self.model.estimate([frame], first_frame=number)
-        return [label for label in objects if label.category in self.categories]
+        (objects,) = self.model.estimate([frame], first_frame=number, categories=self.categories)
+        return objects

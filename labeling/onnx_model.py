@@ -64,18 +64,21 @@ class OnnxModel:
         self._session = _open_session(path, resolve_providers(providers), threads)
         self.providers: tuple[str, ...] = tuple(self._session.get_providers())
         self._graph = _check_graph(self._session, card, path)
+        self._run_options = onnxruntime.RunOptions()
+        self._run_options.only_execute_path_to_fetches = True
 
     @property
     def weights_sha256(self) -> str:
         """Hex SHA-256 of the ONNX file, for receipts."""
         return file_sha256(self.path)
 
-    def run(self, batch: np.ndarray) -> list[np.ndarray]:
+    def run(self, batch: np.ndarray, *, outputs: Sequence[int] | None = None) -> list[np.ndarray]:
         """The card's outputs, in its order, for any number of inputs.
 
         Args:
             batch: (N, 3, input_height, input_width) float32, normalised as the card says. A graph with a fixed batch is
                 called as often as it takes.
+            outputs: which of them, by place; all by default. What only the others need is not computed.
 
         Raises:
             ModelError: the shape is not the card's, the network fails, or its output is not finite.
@@ -85,10 +88,11 @@ class OnnxModel:
             raise ModelError(
                 f"{self.card.name} takes float32 (N, {wanted}), got {batch.dtype} {batch.shape}; resize first"
             )
-        parts = [self._run_chunk(chunk) for chunk in self._chunks(batch)]
+        chosen = range(len(self._graph.output_names)) if outputs is None else outputs
+        parts = [self._run_chunk(chunk, [self._graph.output_names[i] for i in chosen]) for chunk in self._chunks(batch)]
         if not parts:
-            shapes = self.card.output_shapes().values()
-            return [np.zeros((0, *(size or 0 for size in shape[1:])), np.float32) for shape in shapes]
+            shapes = list(self.card.output_shapes().values())
+            return [np.zeros((0, *(size or 0 for size in shapes[i][1:])), np.float32) for i in chosen]
         return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
     def _chunks(self, batch: np.ndarray) -> Iterator[np.ndarray]:
@@ -96,18 +100,18 @@ class OnnxModel:
         for start in range(0, len(batch), size):
             yield batch[start : start + size]
 
-    def _run_chunk(self, chunk: np.ndarray) -> list[np.ndarray]:
+    def _run_chunk(self, chunk: np.ndarray, names: list[str]) -> list[np.ndarray]:
         fixed, count = self._graph.batch, len(chunk)
         if fixed and count < fixed:
             chunk = np.concatenate([chunk, np.repeat(chunk[-1:], fixed - count, axis=0)])
         try:
-            results = self._session.run(list(self._graph.output_names), {self._graph.input_name: chunk})
+            results = self._session.run(names, {self._graph.input_name: chunk}, self._run_options)
         except Exception as error:  # onnxruntime raises a dozen private types
             raise ModelError(
                 f"{self.card.name} failed on {chunk.shape}: {first_line(error)}; check {self.path}"
             ) from error
         outputs = [np.asarray(result) for result in results]
-        for name, output in zip(self._graph.output_names, outputs, strict=True):
+        for name, output in zip(names, outputs, strict=True):
             if not np.isfinite(output).all():
                 raise ModelError(
                     f"{self.card.name} gave NaN or infinity in {name!r}; check the file {self.path} and its precision "

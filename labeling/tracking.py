@@ -23,8 +23,12 @@ _ROW_WEIGHTS = np.linspace(0.5, 1.5, 12) / 12
 """Where two lines are compared, as shares of the rows that both cross, from the top, and what each row weighs."""
 
 
-_FORGET_SIZE = 0.01
-"""Share of its full size that an object may lose per frame: what drives away gets smaller too, but slowly."""
+_PAST_FRAMES = 36
+"""Frames over which a track remembers where it was seen."""
+_LEVER_FRAMES = 8
+"""Two sightings tell a speed when they are at least so far apart: boxes shake, and a walker's swings with the legs."""
+_STEADY_GROWTH = 0.01
+"""Share by which the height of what comes neither nearer nor goes may change per frame: such objects move evenly."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,8 +59,8 @@ class _Track:
     """(4, 2): centre x, centre y, log width, log height, each with its change per frame."""
     covariance: np.ndarray
     """(4, 2, 2)."""
-    full_size: np.ndarray
-    """(2,) log width and height of the whole object, as far as it was seen."""
+    past: np.ndarray
+    """(n, 5): frames since each sighting of the last ``_PAST_FRAMES``, then centre x, y, log width and height."""
     lost_frames: int
 
     @property
@@ -120,6 +124,9 @@ class BoxTracker:
         self._associate(unmatched, boxes, ids, low, frame_step)
         for index in high:
             ids[index] = self._start(boxes[index])
+        for track in seen:
+            if track.lost_frames:
+                _coast(track)
         self._tracks = [track for track in self._tracks if track.lost_frames <= self.settings.max_lost_frames]
         return ids
 
@@ -146,6 +153,7 @@ class BoxTracker:
             if allowed[row, column]:
                 taken[column] = True
                 _correct(tracks[row], boxes[chosen[column]])
+                _remember(tracks[row], boxes[chosen[column]])
                 tracks[row].lost_frames = 0
                 ids[chosen[column]] = tracks[row].track_id
         return chosen[~taken]
@@ -158,7 +166,7 @@ class BoxTracker:
         covariance[:, 0, 0], covariance[:, 1, 1] = spread**2, spread**2
         self._tracks.append(
             _Track(
-                track_id=self.next_id, mean=mean, covariance=covariance, full_size=mean[2:, 0].copy(), lost_frames=0
+                track_id=self.next_id, mean=mean, covariance=covariance, past=_sighting(box_xyxy), lost_frames=0
             )
         )  # fmt: skip
         self.next_id += 1
@@ -370,6 +378,34 @@ def _measurement(box_xyxy: np.ndarray) -> np.ndarray:
     return np.concatenate([(box_xyxy[:2] + box_xyxy[2:]) / 2, np.log(size)])
 
 
+def _sighting(box_xyxy: np.ndarray) -> np.ndarray:
+    """(1, 5) row of ``_Track.past``."""
+    return np.concatenate([[0.0], _measurement(box_xyxy)])[None]
+
+
+def _remember(track: _Track, box_xyxy: np.ndarray) -> None:
+    track.past = np.concatenate([track.past[track.past[:, 0] < _PAST_FRAMES], _sighting(box_xyxy)])
+
+
+def _coast(track: _Track) -> None:
+    """Let an object that went behind something go on as it went before.
+
+    Its last boxes are what was left in view: their middle stops at the edge of what hides it. The line through most
+    sightings does not (Theil 1950, Sen 1968: the median of the slopes of pairs, of which three in ten may be wrong).
+    """
+    ago, places = -track.past[:, 0], track.past[:, 1:]
+    first, second = np.triu_indices(len(ago), 1)
+    apart = ago[second] - ago[first]
+    far = apart >= _LEVER_FRAMES
+    if not far.any():
+        return
+    slopes = np.median((places[second] - places[first])[far] / apart[far, None], axis=0)
+    if abs(slopes[3]) > _STEADY_GROWTH:
+        return
+    track.mean[:2] = np.stack([np.median(places[:, :2] - slopes[:2] * ago[:, None], axis=0), slopes[:2]], axis=1)
+    track.mean[2:] = np.stack([np.median(places[:, 2:], axis=0), np.zeros(2)], axis=1)
+
+
 def _predict(track: _Track, steps: int) -> None:
     transition = np.array([[1.0, steps], [0.0, 1.0]])
     if track.lost_frames:
@@ -382,18 +418,12 @@ def _predict(track: _Track, steps: int) -> None:
     noise = np.array([[steps**3 / 3, steps**2 / 2], [steps**2 / 2, steps]])
     track.covariance = transition @ track.covariance @ transition.T + strength[:, None, None] * noise
     track.lost_frames += steps
-    track.full_size = track.full_size - _FORGET_SIZE * steps
+    track.past = track.past + np.array([steps, 0, 0, 0, 0])
 
 
 def _correct(track: _Track, box_xyxy: np.ndarray) -> None:
-    measured, predicted = _measurement(box_xyxy), track.mean[:, 0]
-    # A box that is smaller than the object may be what a column leaves in view of it. All that is known then is that
-    # the whole contains it: were its middle believed, the object would seem to stop at the column's edge.
-    track.full_size = np.maximum(measured[2:], track.full_size)
-    reach = (np.exp(track.full_size) - np.exp(measured[2:])) / 2
-    centre = np.clip(predicted[:2], measured[:2] - reach, measured[:2] + reach)
-    innovation = np.concatenate([centre, measured[2:]]) - predicted
-    sigma = np.concatenate([np.full(2, 0.03 * _size_px(box_xyxy)), np.hypot(0.04, track.full_size - measured[2:])])
+    sigma = np.array([0.03 * _size_px(box_xyxy), 0.03 * _size_px(box_xyxy), 0.04, 0.04])
+    innovation = _measurement(box_xyxy) - track.mean[:, 0]
     gain = track.covariance[:, :, 0] / (track.covariance[:, 0, 0] + sigma**2)[:, None]
     track.mean = track.mean + gain * innovation[:, None]
     track.covariance = track.covariance - gain[:, :, None] * track.covariance[:, :1, :]
@@ -406,5 +436,7 @@ def _turned(line: np.ndarray, previous_to_current: np.ndarray) -> np.ndarray:
 
 
 def _move_with_camera(track: _Track, previous_to_current: np.ndarray) -> None:
-    moved = previous_to_current @ np.array([*track.mean[:2, 0], 1.0])
-    track.mean[:2, 0] = moved[:2] / moved[2]
+    centres = np.concatenate([track.mean[None, :2, 0], track.past[:, 1:3]])
+    moved = np.concatenate([centres, np.ones((len(centres), 1))], axis=1) @ previous_to_current.T
+    centres = moved[:, :2] / moved[:, 2:]
+    track.mean[:2, 0], track.past[:, 1:3] = centres[0], centres[1:]

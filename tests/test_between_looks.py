@@ -42,6 +42,16 @@ def test_a_lost_object_is_carried_on_for_a_while() -> None:
     assert [label.frame for label in labels] == [1, 2, 3, 4]
 
 
+def test_what_flow_lost_is_not_shown_on() -> None:
+    """Something steps before an object: flow loses it, and the next look does not see it."""
+    between = BetweenLooks(flow_step=2, shown_frames=4)
+    between.start([seen(0)], frame=0, grey=grey(0))
+    assert between.carry(grey(2), frame=2)
+    assert not between.carry(np.random.default_rng(0).integers(0, 256, grey(4).shape, np.uint8), frame=4)
+    labels, _ = between.close([], frame=6)
+    assert [label.frame for label in labels] == [1, 2]
+
+
 def test_a_new_object_is_carried_back_for_a_while() -> None:
     """Another object was there all the time, so that flow has a way; the new one is followed back along it."""
     labels, _ = carried_to(8, first=[seen(0)]).close([seen(8), seen(8, track_id=1)], frame=8)

@@ -10,7 +10,7 @@ from moving_card import HEIGHT, WIDTH, MovingCard, texture
 from labeling.carrying import carry, close_gap, interpolate_gap, small_grey
 from labeling.efforts import EFFORTS, Effort, straight_gap
 from labeling.errors import ConfigError, ModelError
-from labeling.extraction import label_with
+from labeling.extraction import label_with, same_picture
 from labeling.extractors import choose_extractors
 from labeling.labels import POINT_CARRIED, POINT_DETECTED, POINT_INTERPOLATED, Keypoints
 
@@ -54,6 +54,31 @@ def test_the_last_frame_is_looked_at() -> None:
     scene = MovingCard()
     label_with([scene], (scene.render(t) for t in range(38)), first_frame=0, effort="fast")
     assert scene.seen[-1] == 37
+
+
+@pytest.mark.parametrize("effort", ["exact", "balanced", "fast"])
+def test_a_picture_shown_again_is_the_same_moment(effort: Effort) -> None:
+    """A second that stands still in the midst of a drive: nothing drifts, nothing is looked at, ids go on."""
+    order = [*range(20), *[19] * 24, *range(20, 40)]
+    plain, frozen = MovingCard(speed=1.7), MovingCard(speed=1.7)
+    labels = label_with([plain], (plain.render(t) for t in range(40)), first_frame=5, effort=effort)
+    held = label_with([frozen], (frozen.render(t) for t in order), first_frame=5, effort=effort)
+    assert frozen.seen == plain.seen
+    assert [label.frame for label in held] == list(range(5, 5 + len(order)))
+    for label, moment in zip(held, order, strict=True):
+        np.testing.assert_array_equal(label.points, labels[moment].points)
+        np.testing.assert_array_equal(label.point_source, labels[moment].point_source)
+
+
+def test_what_a_coder_changes_is_the_same_picture_and_noise_is_not() -> None:
+    picture = MovingCard().render(3)
+    rng = np.random.default_rng(0)
+    coded = np.clip(picture + rng.integers(-2, 3, picture.shape), 0, 255).astype(np.uint8)
+    noisy = np.clip(picture + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
+    moved = MovingCard().render(4)
+    assert same_picture(picture, picture.copy()) and same_picture(picture, coded)
+    assert not same_picture(picture, noisy) and not same_picture(picture, moved)
+    assert not same_picture(picture, picture[:-2])
 
 
 def test_nothing_is_carried_over_a_cut() -> None:

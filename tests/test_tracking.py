@@ -1,6 +1,7 @@
 """Track ids on made-up motion whose right answer is known."""
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 import pytest
@@ -61,6 +62,38 @@ def test_crossing_people_do_not_swap() -> None:
     assert len(set(ids[:, 0])) == 1
     assert set(ids[:30, 1]) == set(ids[60:, 1])
     assert ids[0, 0] != ids[0, 1]
+
+
+def walkers_behind_a_column(frame: int, *, phase: float, gap_px: float, speed: float) -> list[np.ndarray | None]:
+    """What shows of two people who pass each other behind a column from x = 205 to 380; their legs open and close."""
+    shown: list[np.ndarray | None] = []
+    for number, (start, step) in enumerate(((60, speed), (520 + gap_px, -speed))):
+        middle = start + step * frame
+        width = 70 + 22 * np.cos(2 * np.pi * (frame + phase + 9 * number) / 11)
+        left, right = middle - width / 2, middle + width / 2
+        if left < 205:
+            right = min(right, 205)
+        elif right > 380:
+            left = max(left, 380)
+        hidden = left >= 205 and right <= 380
+        shown.append(None if hidden or right - left < 20 else np.array([left, 300, right, 460]))
+    return shown
+
+
+def test_people_who_pass_behind_a_column_come_out_as_themselves() -> None:
+    """Each stops being seen at one edge and comes out at the other, where the other one just went in."""
+    switched, passages = 0, 0
+    for phase, gap_px, speed in product(range(0, 11, 2), (-60, -20, 0, 20, 60), (4.5, 5.2, 6.0)):
+        rng = np.random.default_rng(int(phase + gap_px + 100))
+        frames = [walkers_behind_a_column(t, phase=phase, gap_px=gap_px, speed=speed) for t in range(85)]
+        paths = [
+            [None if box is None else box + rng.normal(0, 2.5, 4) for box in path] for path in zip(*frames, strict=True)
+        ]
+        for column in follow(paths).T:
+            found = column[column != UNTRACKED]
+            switched += len(set(found.tolist())) > 1
+            passages += 1
+    assert switched <= 0.15 * passages, f"{switched} of {passages}"
 
 
 def test_small_fast_objects_are_kept() -> None:
