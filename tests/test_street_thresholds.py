@@ -1,14 +1,12 @@
 """The street models' thresholds, and how bottom-up cars are judged."""
 
 import numpy as np
-import pytest
 
 from labeling.detection import Detections
 from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
-from training.street_field_scores import judge_car_fields
-from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, plan_streets
+from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, plan_lessons, plan_streets
 from training.street_pool import ObjectTruth
-from training.street_scores import Tally
+from training.street_scores import Tally, judge_car_fields
 from training.street_thresholds import BOX_SCORES, best_threshold, counts_exactly
 
 
@@ -84,15 +82,23 @@ def test_missed_bottom_up_cars_and_phantoms_count_against_the_model() -> None:
 
 
 def test_no_street_both_trains_chooses_and_judges() -> None:
-    seeds = [
-        {plan.config.seed for plan in plan_streets(first, count)}
-        for first, count in ((TRAIN_SEED, 240), (VALIDATION_SEED, 30), (HELD_OUT_SEED, 30))
-    ]
+    plans = [
+        plan_lessons(TRAIN_SEED, 400, frames=7, every=15), plan_streets(VALIDATION_SEED, 30),
+        plan_streets(HELD_OUT_SEED, 30),
+    ]  # fmt: skip
+    seeds = [{plan.config.seed for plan in each} for each in plans]
     assert len(set.union(*seeds)) == sum(map(len, seeds))
 
 
-@pytest.mark.parametrize("crowded", [False, True])
-def test_only_learners_see_crowds(crowded: bool) -> None:
-    walkers = [plan.config.walkers_per_100_m for plan in plan_streets(7, 40, crowded=crowded)]
-    assert (max((value or 0) for value in walkers) == 30) == crowded
-    assert None in walkers
+def test_learners_see_every_scene_crowded_and_not_from_any_camera() -> None:
+    lessons = [plan.config for plan in plan_lessons(7, 240, frames=2, every=3)]
+    busy = {config.scenario for config in lessons} - {"empty", "wall", "road_only"}
+    for scene in busy:
+        mine = [config for config in lessons if config.scenario == scene]
+        assert {config.focal_px is None for config in mine} == {True, False}, scene
+        assert len({config.walkers_per_100_m for config in mine}) > 2, scene
+
+
+def test_judges_see_streets_as_they_are() -> None:
+    walkers = {plan.config.walkers_per_100_m for plan in plan_streets(7, 40)}
+    assert walkers == {None}

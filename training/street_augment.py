@@ -140,6 +140,38 @@ def _glare(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (picture + glow[..., None] * (_LAMP_COLOUR - picture)).astype(np.uint8)
 
 
+def put_board(
+    picture: np.ndarray, box_xyxy: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A board, evenly coloured or coarsely patterned, over 15 to 60 % of a box, from one of its sides.
+
+    Args:
+        picture: (h, w, 3) uint8 RGB.
+        box_xyxy: (4,) pixels.
+        rng: source of every draw.
+
+    Returns:
+        The picture with the board, the board's place (4,), and the rest of the box (4,).
+    """
+    box = np.asarray(box_xyxy, np.float64)
+    sides = box[2:] - box[:2]
+    # From the left or the right mostly: what stands before a car or a walker stands on the ground.
+    edge = int(rng.choice(4, p=(0.4, 0.1, 0.4, 0.1)))
+    axis, low = edge % 2, edge < 2
+    reach = rng.uniform(0.15, 0.6) * sides[axis]
+    cover, rest = np.concatenate([box[:2] - 0.2 * sides, box[2:] + 0.2 * sides]), box.copy()
+    cover[axis + 2 if low else axis] = rest[edge] = box[axis] + reach if low else box[axis + 2] - reach
+    height, width = picture.shape[:2]
+    left, top, right, bottom = np.clip(np.rint(cover).astype(int), 0, (width, height, width, height)).tolist()
+    if right > left and bottom > top:
+        cells = rng.normal(0, rng.uniform(0, 30), (int(rng.integers(1, 12)), int(rng.integers(1, 8)), 1))
+        shade = cv2.resize(cells.astype(np.float32), (right - left, bottom - top), interpolation=cv2.INTER_LINEAR)
+        colour = rng.uniform(20, 235) + rng.normal(0, 25, 3)
+        picture = picture.copy()
+        picture[top:bottom, left:right] = np.clip(colour + shade[..., None], 0, 255).astype(np.uint8)
+    return picture, cover, rest.astype(np.float32)
+
+
 _grain_bank: list[np.ndarray] = []
 
 

@@ -1,7 +1,8 @@
 """Batches for each street model: pool pictures, moved and disturbed, with the targets that belong to them."""
 
+import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -11,7 +12,7 @@ import torch
 from labeling.detection import LETTERBOX_GREY
 from labeling.model_cards import IMAGENET_MEAN, IMAGENET_STD
 from labeling.schemas import Category, KeypointSchema, keypoint_schema
-from training.street_augment import AugmentSettings, disturb, map_boxes, map_points, random_map
+from training.street_augment import AugmentSettings, disturb, map_boxes, map_points, put_board, random_map
 from training.street_networks import FIELD_STRIDE
 from training.street_pool import ObjectTruth, PoolCrop, PoolFrame, StreetPool, frames_with
 from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses
@@ -20,10 +21,12 @@ CLASSES: tuple[Category, ...] = ("car", "person")
 CROP_PADDING = 1.25
 LEAST_SHARE = 0.15
 """Objects of which less is visible are left out of the detector's loss: neither asked for nor forbidden."""
-_LEAST_WINDOW_PX = 5.0
+_LEAST_WINDOW_PX = 9.0
+"""Lower objects are left out of the detector's loss too: of all objects a tenth, and of no use."""
 _HIDDEN_WEIGHT = 0.25
 _MEAN_COLOUR = tuple(float(round(value)) for value in IMAGENET_MEAN)
 _BOX_SLACK_PX = 2.0
+_USUAL_CROP_PX = 40.0
 _FOUND_WITHIN = 0.1
 """Of the box diagonal: what PCK@0.1 calls right."""
 
@@ -61,32 +64,32 @@ class DetectorBatches:
     """Windows of frames with grid targets."""
 
     pool: StreetPool
-    size: tuple[int, int]
-    """Width and height of a window, multiples of 32."""
-    count: int
+    sizes: tuple[tuple[int, int, int], ...]
+    """Width and height of a window, multiples of 32, and how many make a batch; each batch draws one of these."""
     augment: AugmentSettings
     scales: tuple[float, float] = (0.85, 1.2)
-    person_share: float = 0.35
+    person_share: float = 0.5
     """Of windows around a person: they are small and rare."""
 
     def __call__(self, rng: np.random.Generator) -> Batch:
         """One batch: targets are classes (N, A) and boxes (N, A, 4)."""
         pictures, classes, boxes = [], [], []
         with_people = frames_with(self.pool, "person")
-        for _ in range(self.count):
+        *size, count = self.sizes[int(rng.integers(len(self.sizes)))]
+        for _ in range(count):
             people = bool(len(with_people)) and rng.random() < self.person_share
             index = int(rng.choice(with_people)) if people else int(rng.integers(len(self.pool.frames)))
             frame = self.pool.frames[index]
             height, width = frame.picture.shape[:2]
             picture_to_window = random_map(
-                rng, source=(width, height), target=self.size, scales=self.scales, flip=rng.random() < 0.5,
+                rng, source=(width, height), target=(size[0], size[1]), scales=self.scales, flip=rng.random() < 0.5,
                 focus_xy=self._focus(frame, rng, "person" if people else "car"),
             )  # fmt: skip
             grey = (LETTERBOX_GREY,) * 3
-            window = cv2.warpAffine(frame.picture, picture_to_window, self.size, borderValue=grey)
+            window = cv2.warpAffine(frame.picture, picture_to_window, size, borderValue=grey)
             found = [truth for truth in frame.objects if truth.category in CLASSES]
-            inside, labels, counted = self._boxes(found, frame.scale, picture_to_window)
-            targets = encode_boxes(inside, labels, counted, width=self.size[0], height=self.size[1])
+            inside, labels, counted = _boxes_inside(found, frame.scale, picture_to_window, size)
+            targets = encode_boxes(inside, labels, counted, width=size[0], height=size[1])
             pictures.append(disturb(window, rng, self.augment))
             classes.append(targets.classes)
             boxes.append(targets.boxes_xyxy)
@@ -103,20 +106,22 @@ class DetectorBatches:
         box = boxes[int(rng.choice(len(boxes), p=weights / weights.sum()))]
         return (box[:2] + box[2:]) / 2 * frame.scale
 
-    def _boxes(
-        self, found: list[ObjectTruth], scale: float, picture_to_window: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        if not found:
-            return np.zeros((0, 4), np.float32), np.zeros(0, np.int64), np.zeros(0, bool)
-        whole = map_boxes(np.stack([truth.box_xyxy for truth in found]) * scale, picture_to_window)
-        inside = np.clip(whole, 0, np.tile(self.size, 2))
-        sides, whole_sides = inside[:, 2:] - inside[:, :2], whole[:, 2:] - whole[:, :2]
-        left = np.prod(sides, axis=1) / np.maximum(np.prod(whole_sides, axis=1), 1e-6)
-        shares = left * np.array([truth.visible_share for truth in found])
-        labels = np.array([CLASSES.index(truth.category) for truth in found])
-        touching = (sides > 1).all(axis=1)
-        counted = (shares >= LEAST_SHARE) & (sides[:, 1] >= _LEAST_WINDOW_PX) & touching
-        return inside[touching].astype(np.float32), labels[touching], counted[touching]
+
+def _boxes_inside(
+    found: list[ObjectTruth], scale: float, picture_to_window: np.ndarray, size: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes (n, 4), classes and whether they count, of what touches a window of width and height ``size``."""
+    if not found:
+        return np.zeros((0, 4), np.float32), np.zeros(0, np.int64), np.zeros(0, bool)
+    whole = map_boxes(np.stack([truth.box_xyxy for truth in found]) * scale, picture_to_window)
+    inside = np.clip(whole, 0, np.tile(size, 2))
+    sides, whole_sides = inside[:, 2:] - inside[:, :2], whole[:, 2:] - whole[:, :2]
+    left = np.prod(sides, axis=1) / np.maximum(np.prod(whole_sides, axis=1), 1e-6)
+    shares = left * np.array([truth.visible_share for truth in found])
+    labels = np.array([CLASSES.index(truth.category) for truth in found])
+    touching = (sides > 1).all(axis=1)
+    counted = (shares >= LEAST_SHARE) & (sides[:, 1] >= _LEAST_WINDOW_PX) & touching
+    return inside[touching].astype(np.float32), labels[touching], counted[touching]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,13 +134,17 @@ class CropBatches:
     """Width and height of the network's input."""
     count: int
     augment: AugmentSettings
+    board_share: float = 0.15
+    """Of crops with a board before the object: nothing else hides a part of it so sharply."""
 
     def __call__(self, rng: np.random.Generator) -> Batch:
         """One batch: targets are responses along x and y, weights, visibility, and the tolerance in bins."""
         order = mirror_order(keypoint_schema(self.schema))
         pictures, points, visible, tolerances = [], [], [], []
-        for index in rng.integers(0, len(self.crops), self.count):
+        for index in np.searchsorted(_running_shares(self.crops), rng.random(self.count), side="right"):
             crop, flip = self.crops[index], bool(rng.random() < 0.5)
+            if rng.random() < self.board_share:
+                crop = behind_board(crop, rng)
             crop_to_input, scale = self._map(crop, rng, flip)
             picture = cv2.warpAffine(crop.picture, crop_to_input, self.size, flags=cv2.INTER_LINEAR)
             pictures.append(disturb(picture, rng, self.augment))
@@ -171,6 +180,25 @@ class CropBatches:
         weights = np.where(seen, 1.0, _HIDDEN_WEIGHT * inside).astype(np.float32)
         arrays = (along_x, along_y, weights, seen.astype(np.float32), np.array(tolerances, np.float32))
         return tuple(torch.from_numpy(array) for array in arrays)
+
+
+@functools.lru_cache(maxsize=4)
+def _running_shares(crops: tuple[PoolCrop, ...]) -> np.ndarray:
+    """(n,) where each crop's share of the draws ends: far objects are many and small, near ones few."""
+    heights = np.array([crop.truth.box_xyxy[3] - crop.truth.box_xyxy[1] for crop in crops])
+    shares = np.clip(heights / _USUAL_CROP_PX, 0.5, 3)
+    ends = np.cumsum(shares) / shares.sum()
+    ends[-1] = 1.0
+    return ends
+
+
+def behind_board(crop: PoolCrop, rng: np.random.Generator) -> PoolCrop:
+    """A crop whose object is partly behind a board: its box is what is left, its points there are hidden."""
+    picture, cover, rest = put_board(crop.picture, crop.truth.box_xyxy, rng)
+    points = crop.truth.points_xy
+    covered = ((points >= cover[:2]) & (points <= cover[2:])).all(axis=1)
+    truth = replace(crop.truth, box_xyxy=rest, visible=crop.truth.visible & ~covered)
+    return PoolCrop(picture=picture, truth=truth)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,13 +25,13 @@ class FitSettings:
     learning_rate: float = 2e-3
     """Peak of AdamW's rate; it warms up over the first twentieth and falls to nothing along a cosine."""
     weight_decay: float = 0.01
-    average_decay: float = 0.995
+    average_decay: float = 0.998
     """Of the moving average of weights that is returned."""
     precision: torch.dtype = torch.bfloat16
     """Of convolutions and products; weights and losses stay float32."""
     channels_last: bool = True
     """Lay pictures out pixel by pixel, which 2-D convolutions are faster on; networks over videos cannot."""
-    report_every: int = 200
+    report_every: int = 500
     name: str = "network"
 
 

@@ -5,6 +5,7 @@ With ``--checkpoints FOLDER`` a run that was stopped goes on where it was, and e
 """
 
 import argparse
+import ctypes
 import json
 import resource
 import time
@@ -18,19 +19,20 @@ import torch
 from labeling.detection import Detector
 from labeling.fields import FieldModel
 from labeling.keypoints import KeypointHead
-from labeling.model_cards import SHIPPED_CARDS, CifcafCard, ModelCard, SimccCard, YoloxCard, read_card
+from labeling.model_cards import SHIPPED_CARDS, ModelCard, SimccCard, YoloxCard, read_card
 from labeling.model_cards import write_card as write_model_card
 from training.street_export import export_model
-from training.street_field_scores import judge_car_fields
 from training.street_fitting import fit
-from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, judging_frames, plan_streets
+from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, judging_frames, plan_lessons
 from training.street_pool import StreetPool, render_pool
-from training.street_recipes import CAR_FIELDS, MODEL_NAMES, ModelName, Recipe, recipe
+from training.street_recipes import MODEL_NAMES, ModelName, Recipe, recipe
 from training.street_scores import StreetModels, Tally, judge_frame
 from training.street_thresholds import choose_thresholds
 
 WORKERS = 2
 """Processes that render and train."""
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+"""Of mallopt(3)."""
 JUDGED_FRAMES = 6
 """Of each street that chooses thresholds or judges."""
 
@@ -69,23 +71,30 @@ def train_models(
 def _train_job(job: _Job) -> tuple[str, float]:
     name, folder, checkpoints, seed, share = job
     torch.set_num_threads(1)
+    _keep_memory()
     start = time.perf_counter()
     train_model(recipe(name, seed=seed, share=share), _shared_pool[0], folder, checkpoints=checkpoints)
     return name, time.perf_counter() - start
 
 
+def _keep_memory() -> None:
+    """Let glibc keep what is freed: fetching a step's activations from the system anew is a seventh of its time."""
+    library = ctypes.CDLL(None)
+    if hasattr(library, "mallopt"):
+        for parameter, value in ((_M_MMAP_MAX, 0), (_M_TRIM_THRESHOLD, 2**31 - 1)):
+            library.mallopt(parameter, value)
+
+
 def evaluate(folder: Path, *, streets: int = 30, frames: int = JUDGED_FRAMES) -> dict[str, float]:
     """Figures of the models in ``folder`` on held-out streets, through the labelling code."""
-    models, cars, tally = open_models(folder), open_car_fields(folder), Tally()
+    models, tally = open_models(folder), Tally()
     for rgb, truths in judging_frames(HELD_OUT_SEED, streets, frames):
         judge_frame(models, rgb, truths, tally)
-        if cars is not None:
-            judge_car_fields(cars.estimate([rgb])[0], truths, tally)
     return tally.figures()
 
 
 def open_models(folder: Path) -> StreetModels:
-    """Whichever street models ``folder`` has, but for the bottom-up cars."""
+    """Whichever street models ``folder`` has."""
     cards = {name: read_card(folder / f"{name}.toml") for name in MODEL_NAMES if (folder / f"{name}.toml").is_file()}
     detector, fields, heads = None, None, {}
     for card in cards.values():
@@ -98,21 +107,13 @@ def open_models(folder: Path) -> StreetModels:
     return StreetModels(detector=detector, heads=heads, fields=fields)
 
 
-def open_car_fields(folder: Path) -> FieldModel | None:
-    """The model of bottom-up cars, where ``folder`` has it."""
-    path = folder / f"{CAR_FIELDS}.toml"
-    card = read_card(path) if path.is_file() else None
-    return FieldModel(card, folder / card.file) if isinstance(card, CifcafCard) else None
-
-
 def write_figures(folder: Path, figures: dict[str, float], *, frames: int) -> None:
     """Put each model's figures into its card."""
     prefixes = {
         "street_detector": ("car_recall", "car_phantoms", "person_recall", "person_phantoms", "count"),
         "street_car24": ("car_pck", "car_shown", "car_hidden", "car_right"),
         "street_coco17": ("person_pck", "person_shown", "person_hidden", "person_right"),
-        "street_lane24": ("lane_",),
-        CAR_FIELDS: ("fields_",),
+        "street_fields": ("lane_", "fields_"),
     }
     notes = (
         f"Figures: {frames} frames of streets never trained on (seeds from {HELD_OUT_SEED}); "
@@ -129,9 +130,7 @@ def write_figures(folder: Path, figures: dict[str, float], *, frames: int) -> No
 def train_all(options: argparse.Namespace) -> None:
     """The pool, the models that ``--only`` names, and their thresholds."""
     start = time.perf_counter()
-    pool = render_pool(
-        plan_streets(TRAIN_SEED, options.streets, frames=9, every=12, crowded=True), workers=options.workers
-    )
+    pool = render_pool(plan_lessons(TRAIN_SEED, options.streets, frames=7, every=15), workers=options.workers)
     counts = {name: len(found) for name, found in pool.crops.items()}
     print(f"{len(pool.frames)} frames, crops {counts}, {time.perf_counter() - start:.0f} s", flush=True)
     if options.checkpoints:
@@ -147,13 +146,13 @@ def train_all(options: argparse.Namespace) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train what is asked for, then judge it; ``--evaluate`` only judges."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="+", choices=(*MODEL_NAMES, CAR_FIELDS), default=MODEL_NAMES)
+    parser.add_argument("--only", nargs="+", choices=MODEL_NAMES, default=MODEL_NAMES)
     parser.add_argument("--evaluate", action="store_true", help="judge what is there, train nothing")
     parser.add_argument("--out", type=Path, default=SHIPPED_CARDS)
     parser.add_argument("--checkpoints", type=Path, help="folder from which a stopped run goes on")
     parser.add_argument("--results", type=Path, help="JSON file for the figures and the time")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--streets", type=int, default=240, help="streets to learn from, 9 frames each")
+    parser.add_argument("--streets", type=int, default=384, help="streets to learn from, 7 frames each")
     parser.add_argument("--judged-streets", type=int, default=30)
     parser.add_argument("--share", type=float, default=1.0, help="share of the full number of steps")
     parser.add_argument("--workers", type=int, default=WORKERS, help="processes that render and train")

@@ -5,6 +5,7 @@ cards*). Shape suffixes: N pictures, A grid cells of all strides, C classes, K p
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import nn
@@ -81,20 +82,33 @@ class Pyramid(nn.Module):
 
 
 class StreetDetector(nn.Module):
-    """A YOLOX-like detector: one prediction per cell of strides 8, 16 and 32, one head shared by all of them."""
+    """A YOLOX-like detector: one prediction per cell of strides 8, 16 and 32, one head shared by all of them.
 
-    def __init__(self, classes: int, *, widths: Sequence[int] = (32, 48, 72, 112), width: int = 48) -> None:
+    A last stage at stride 64 predicts nothing: it sees both ends of a near car, which would else be found twice. Most
+    of the time goes to stride 8, so that by default nothing but the pyramid works there (``towers``: which strides have
+    a convolution of their own before the head).
+    """
+
+    def __init__(
+        self,
+        classes: int,
+        *,
+        widths: Sequence[int] = (32, 48, 80, 112, 128),
+        depths: Sequence[int] = (1, 2, 2, 1),
+        width: int = 48,
+        towers: Sequence[bool] = (False, True, True),
+    ) -> None:
         super().__init__()
-        self.trunk = Trunk(widths, (1, 1, 1))
+        self.trunk = Trunk(widths, depths)
         self.pyramid = Pyramid(widths[1:], width)
-        self.tower = nn.ModuleList(conv_unit(width, width) for _ in DETECTOR_STRIDES)
+        self.tower = nn.ModuleList(conv_unit(width, width) if built else nn.Identity() for built in towers)
         self.head = nn.Conv2d(width, 5 + classes, 1)
         # A cell holds an object about once in a hundred (Lin et al. 2017, focal loss).
         nn.init.constant_(self.head.bias[4:5], -4.6)  # type: ignore[index]
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
         """(N, 3, H, W) BGR 0 to 255 to (N, A, 5 + C): offset x, y, log size w, h, then logits."""
-        features = self.pyramid(self.trunk(pictures / 64.0 - 2.0))
+        features = self.pyramid(self.trunk(pictures / 64.0 - 2.0))[: len(DETECTOR_STRIDES)]
         rows = [self.head(tower(x)).flatten(2) for tower, x in zip(self.tower, features, strict=True)]
         return torch.cat(rows, dim=2).transpose(1, 2)
 
@@ -161,14 +175,18 @@ def _peak_one(logits: torch.Tensor) -> torch.Tensor:
 
 
 class FieldNetwork(nn.Module):
-    """Composite intensity and association fields at stride 8 for one or more schemas (Kreiss et al. 2019)."""
+    """Composite intensity and association fields at stride 8 for one or more schemas (Kreiss et al. 2019).
 
-    def __init__(self, schemas: Sequence[str], *, widths: Sequence[int] = (24, 40, 72, 112), width: int = 48) -> None:
+    The trunk goes down to stride 64: which of its 24 points lies where on a lane, only the whole lane tells.
+    """
+
+    def __init__(
+        self, schemas: Sequence[str], *, widths: Sequence[int] = (32, 48, 64, 96, 112), width: int = 48
+    ) -> None:
         super().__init__()
         self.tables = [keypoint_schema(name) for name in schemas]
-        self.trunk = Trunk(widths, (1, 1, 2))
+        self.trunk = Trunk(widths, (1, 1, 1, 2))
         self.pyramid = Pyramid(widths[1:], width)
-        self.context = ResidualUnit(width)
         self.cif = nn.ModuleList(nn.Conv2d(width, 4 * table.point_count, 1) for table in self.tables)
         self.caf = nn.ModuleList(nn.Conv2d(width, 7 * len(table.edges), 1) for table in self.tables)
         for head, channels in [(head, 4) for head in self.cif] + [(head, 7) for head in self.caf]:
@@ -180,46 +198,43 @@ class FieldNetwork(nn.Module):
         cif (N, K, 4, h, w): confidence logit, x and y offset in cells, log scale;
         caf (N, E, 7, h, w): confidence logit, both ends' x and y offsets in cells, both log scales.
         """
-        x = self.context(self.pyramid(self.trunk(pictures))[0])
+        x = self.pyramid(self.trunk(pictures))[0]
         return [
             (cif(x).unflatten(1, (table.point_count, 4)), caf(x).unflatten(1, (len(table.edges), 7)))
             for cif, caf, table in zip(self.cif, self.caf, self.tables, strict=True)
         ]
 
 
-class FieldGraph(nn.Module):
-    """``FieldNetwork`` as the ``cifcaf`` contract wants it, for a fixed field size.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sharpening:
+    """What is done to one schema's fields for the decoder, which adds and multiplies confidences up."""
 
-    Nothing marks a lane's points, so their cells' confidences are honest but modest, and the decoder adds and
-    multiplies them up: ``gain`` and ``shift`` sharpen their logits, ``widen`` the points' scales.
-    """
+    gain: float = 1.0
+    """Of the confidences' logits."""
+    shift: float = 0.0
+    """Added to them."""
+    widen: float = 1.0
+    """Of the points' scales."""
+
+
+class FieldGraph(nn.Module):
+    """``FieldNetwork`` as the ``cifcaf`` contract wants it, for a fixed field size; one ``Sharpening`` per schema."""
 
     offsets: torch.Tensor
 
-    def __init__(
-        self,
-        network: FieldNetwork,
-        *,
-        columns: int,
-        rows: int,
-        gain: float = 1.0,
-        shift: float = 0.0,
-        widen: float = 1.0,
-    ) -> None:
+    def __init__(self, network: FieldNetwork, *, columns: int, rows: int, sharpen: Sequence[Sharpening]) -> None:
         super().__init__()
-        self.network, self.gain, self.shift, self.widen = network, gain, shift, widen
+        self.network, self.sharpen = network, tuple(sharpen)
         y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
         self.register_buffer("offsets", torch.stack([x, y]).float()[None, None])
 
     def forward(self, pictures: torch.Tensor) -> list[torch.Tensor]:
         """``cif`` (N, K, 5, h, w) and ``caf`` (N, E, 8, h, w), one pair after the other; units are cells."""
         outputs = []
-        for cif, caf in self.network(pictures):
-            confidence = (self.gain * cif[:, :, :1] + self.shift).sigmoid()
-            scale = self.widen * cif[:, :, 3:].clamp(max=_MAX_LOG_SIZE).exp()
-            outputs.append(torch.cat([confidence * 0, confidence, cif[:, :, 1:3] + self.offsets, scale], dim=2))
-            confidence = (self.gain * caf[:, :, :1] + self.shift).sigmoid()
-            ends = [caf[:, :, 1:3] + self.offsets, caf[:, :, 3:5] + self.offsets]
-            scale = self.widen * caf[:, :, 5:].clamp(max=_MAX_LOG_SIZE).exp()
-            outputs.append(torch.cat([confidence * 0, confidence, *ends, scale], dim=2))
+        for (cif, caf), one in zip(self.network(pictures), self.sharpen, strict=True):
+            for field, ends in ((cif, 1), (caf, 2)):
+                confidence = (one.gain * field[:, :, :1] + one.shift).sigmoid()
+                places = [field[:, :, 1 + 2 * end : 3 + 2 * end] + self.offsets for end in range(ends)]
+                scale = one.widen * field[:, :, 1 + 2 * ends :].clamp(max=_MAX_LOG_SIZE).exp()
+                outputs.append(torch.cat([confidence * 0, confidence, *places, scale], dim=2))
         return outputs

@@ -15,14 +15,14 @@ PLANNED: tuple[Scenario, ...] = (
     "traffic", "lead_leaves", "parked", "fast", "sharp_turn", "reverse", "empty", "wall", "road_only", "still",
 )  # fmt: skip
 """Scenarios in turn; busy ones come more often."""
+_LEARNT: tuple[Scenario, ...] = (*PLANNED, "cross_traffic", "cross_traffic", "stop_and_go", "cross_traffic")
+"""Scenarios in turn for learners: cars are seldom seen from the side, and near ones least of all."""
 _WALKERS = (None, 10.0, 20.0, 30.0)
 """People per 100 m that learners see: streets have few, and half of what is to be learnt is people."""
 _DESERTED: tuple[Scenario, ...] = ("empty", "wall", "road_only")
 
 
-def plan_streets(
-    first_seed: int, streets: int, *, frames: int = 12, every: int = 9, crowded: bool = False
-) -> list[RenderPlan]:
+def plan_streets(first_seed: int, streets: int, *, frames: int = 12, every: int = 9) -> list[RenderPlan]:
     """``streets`` streets of consecutive seeds, scenarios in turn, every ``every``-th frame of each.
 
     Three in four are seen by the standard camera, the others from another height, pitch and focal length.
@@ -32,23 +32,45 @@ def plan_streets(
         streets: how many.
         frames: of each street.
         every: step between them.
-        crowded: most streets get more people than their scenario has.
     """
     plans = []
     for index in range(streets):
         seed = first_seed + index
         config = StreetConfig(seed=seed, scenario=PLANNED[index % len(PLANNED)], frames=frames * every)
         if index % 4 == 3:
-            rng = np.random.default_rng((seed, 11))
-            config = replace(
-                config, camera_height_m=rng.uniform(1.2, 1.9), camera_pitch_deg=rng.uniform(-1, 5),
-                focal_px=rng.uniform(850, 1250),
-            )  # fmt: skip
-        if crowded and config.scenario not in _DESERTED:
-            walkers = _WALKERS[int(np.random.default_rng((seed, 13)).integers(len(_WALKERS)))]
-            config = replace(config, walkers_per_100_m=walkers)
-        plans.append(RenderPlan(config=config, frames=tuple(range(index % every, frames * every, every))))
+            config = _other_camera(config, np.random.default_rng((seed, 11)))
+        plans.append(_plan(config, index, frames=frames, every=every))
     return plans
+
+
+def plan_lessons(first_seed: int, streets: int, *, frames: int, every: int) -> list[RenderPlan]:
+    """As ``plan_streets``, for learners: more of what is hard, most streets crowded, every other from another camera.
+
+    The camera is drawn for each street by itself: were every fourth street's another one, each scenario would always be
+    seen by the same kind of camera, since their number is a multiple of four.
+    """
+    plans = []
+    for index in range(streets):
+        seed = first_seed + index
+        rng = np.random.default_rng((seed, 13))
+        config = StreetConfig(seed=seed, scenario=_LEARNT[index % len(_LEARNT)], frames=frames * every)
+        if config.scenario not in _DESERTED:
+            config = replace(config, walkers_per_100_m=_WALKERS[int(rng.integers(len(_WALKERS)))])
+        if rng.random() < 0.5:
+            config = _other_camera(config, rng)
+        plans.append(_plan(config, index, frames=frames, every=every))
+    return plans
+
+
+def _other_camera(config: StreetConfig, rng: np.random.Generator) -> StreetConfig:
+    return replace(
+        config, camera_height_m=rng.uniform(1.2, 1.9), camera_pitch_deg=rng.uniform(-1, 5),
+        focal_px=rng.uniform(850, 1250),
+    )  # fmt: skip
+
+
+def _plan(config: StreetConfig, index: int, *, frames: int, every: int) -> RenderPlan:
+    return RenderPlan(config=config, frames=tuple(range(index % every, frames * every, every)))
 
 
 def judging_frames(first_seed: int, streets: int, frames: int) -> Iterator[tuple[np.ndarray, tuple[ObjectTruth, ...]]]:

@@ -17,6 +17,7 @@ from training.street_networks import (
     DetectorGraph,
     FieldGraph,
     FieldNetwork,
+    Sharpening,
     SimccGraph,
     SimccNetwork,
     StreetDetector,
@@ -24,25 +25,28 @@ from training.street_networks import (
 from training.street_pool import PICTURE_SIZE, StreetPool
 from training.street_targets import grid_cells
 
-ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_lane24", "street_car24_fields"]
-MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)[:4]
-"""Those that ship."""
-CAR_FIELDS: ModelName = "street_car24_fields"
-"""Cars bottom-up, in place of boxes and head: trained on request only. After 800 steps, which find under a fifth of the
-cars, it is not worth shipping."""
+ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_fields"]
+MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
+"""In the order in which they are trained: the longest first."""
 STEPS: dict[ModelName, int] = {
-    "street_detector": 4000, "street_car24": 1300, "street_coco17": 4400, "street_lane24": 1400,
-    "street_car24_fields": 800,
+    "street_detector": 19000, "street_fields": 7500, "street_coco17": 14000, "street_car24": 4000,
 }  # fmt: skip
-_WINDOW = (416, 288)
+_WINDOWS = ((416, 288, 6), (*PICTURE_SIZE, 2))
+"""Of the detector: windows are full of objects, whole pictures show both ends of near cars. Small batches, many steps:
+of the same pictures twice as many find more people."""
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
 _HEAD_WIDTHS = {"car24": (32, 56, 88), "coco17": (32, 56, 88, 72)}
 _HIDDEN_WEIGHTS = {"car24": 1.0, "coco17": 2.0}
 """A walker's far arm and leg come and go: in doubt they are called hidden."""
 _FIELD_SIZE = (529, 353)
-_LANE_VOTES = {"gain": 3.0, "shift": 1.5, "widen": 1.4}
-"""Chosen, as the thresholds, for the decoder's own constants: counts of lanes exact in 78 % of frames against 20 %."""
-_LANE_DECODING = {"point_threshold": 0.3, "instance_threshold": 0.28, "min_points": 4}
+_FIELD_SCHEMAS = ("car24", "lane24")
+_SHARPEN = (Sharpening(), Sharpening(gain=3.0, shift=1.5, widen=1.4))
+"""Nothing marks a lane's points, so that their cells' confidences are honest but modest. Chosen, as the thresholds, for
+the decoder's own constants: counts of lanes exact in 78 % of frames against 20 %."""
+_FIELD_DECODING: dict[str, dict[str, float]] = {
+    "car24": {},
+    "lane24": {"point_threshold": 0.3, "instance_threshold": 0.28, "min_points": 4},
+}
 _LICENCE = "Apache-2.0"
 _SOURCE = "ships with Animatic; `make street-models` trains and exports it again from seeds"
 
@@ -70,19 +74,19 @@ def recipe(name: ModelName, *, seed: int = 1, share: float = 1.0) -> Recipe:
     settings = FitSettings(name=name, seed=seed, steps=max(1, round(STEPS[name] * share)))
     if name == "street_detector":
         return _detector_recipe(settings)
-    if name == "street_lane24":
-        return _field_recipe("lane24", settings, votes=_LANE_VOTES, decoding=_LANE_DECODING)
-    if name == "street_car24_fields":
-        return _field_recipe("car24", settings, votes={}, decoding={})
+    if name == "street_fields":
+        return _field_recipe(settings)
     return _head_recipe(name.removeprefix("street_"), settings)
 
 
 def _detector_recipe(settings: FitSettings) -> Recipe:
-    cells, strides = (torch.from_numpy(array) for array in grid_cells(*_WINDOW))
+    grids = {(width, height): [torch.from_numpy(array) for array in grid_cells(width, height)]
+             for width, height, _ in _WINDOWS}  # fmt: skip
 
     def loss(network: nn.Module, batch: Batch) -> torch.Tensor:
         classes, boxes = batch.targets
-        return detector_loss(network(batch.pictures).float(), classes, boxes, cells, strides)
+        height, width = batch.pictures.shape[2:]
+        return detector_loss(network(batch.pictures).float(), classes, boxes, *grids[width, height])
 
     card = YoloxCard(
         name=settings.name, file=f"{settings.name}.onnx", licence=_LICENCE, source=_SOURCE, classes=CLASSES,
@@ -91,7 +95,7 @@ def _detector_recipe(settings: FitSettings) -> Recipe:
     )  # fmt: skip
     return Recipe(
         card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph, loss=loss, fit=settings,
-        batches=lambda pool: DetectorBatches(pool=pool, size=_WINDOW, count=12, augment=AugmentSettings()),
+        batches=lambda pool: DetectorBatches(pool=pool, sizes=_WINDOWS, augment=AugmentSettings()),
     )  # fmt: skip
 
 
@@ -115,16 +119,20 @@ def _head_recipe(schema: str, settings: FitSettings) -> Recipe:
         card=card, network=lambda: SimccNetwork(schema, size, widths=_HEAD_WIDTHS[schema]), graph=SimccGraph,
         loss=loss, fit=settings,
         batches=lambda pool: CropBatches(
-            crops=pool.crops[card.category], schema=schema, size=size, count=64, augment=augment
+            crops=pool.crops[card.category], schema=schema, size=size, count=32, augment=augment
         ),
     )  # fmt: skip
 
 
-def _field_recipe(schema: str, settings: FitSettings, *, votes: dict[str, float], decoding: dict[str, float]) -> Recipe:
-    head = {"schema": schema, "cif": f"{schema}_cif", "caf": f"{schema}_caf", **decoding}
+def _field_recipe(settings: FitSettings) -> Recipe:
+    heads = [
+        {"schema": schema, "cif": f"{schema}_cif", "caf": f"{schema}_caf", **_FIELD_DECODING[schema]}
+        for schema in _FIELD_SCHEMAS
+    ]
     card = CifcafCard(
         name=settings.name, file=f"{settings.name}.onnx", licence=_LICENCE, source=_SOURCE, stride=FIELD_STRIDE,
-        heads=(FieldHeadCard.model_validate(head),), input_width=_FIELD_SIZE[0], input_height=_FIELD_SIZE[1],
+        heads=tuple(FieldHeadCard.model_validate(head) for head in heads), input_width=_FIELD_SIZE[0],
+        input_height=_FIELD_SIZE[1],
     )  # fmt: skip
     columns, rows = ((side - 1) // FIELD_STRIDE + 1 for side in _FIELD_SIZE)
 
@@ -134,9 +142,9 @@ def _field_recipe(schema: str, settings: FitSettings, *, votes: dict[str, float]
         return torch.stack([field_loss(*truth) for truth in truths]).sum()
 
     return Recipe(
-        card=card, network=lambda: FieldNetwork((schema,)), loss=loss, fit=settings,
-        graph=lambda network: FieldGraph(network, columns=columns, rows=rows, **votes),
+        card=card, network=lambda: FieldNetwork(_FIELD_SCHEMAS), loss=loss, fit=settings,
+        graph=lambda network: FieldGraph(network, columns=columns, rows=rows, sharpen=_SHARPEN),
         batches=lambda pool: FieldBatches(
-            pool=pool, schemas=(schema,), size=_FIELD_SIZE, count=8, augment=AugmentSettings()
+            pool=pool, schemas=_FIELD_SCHEMAS, size=_FIELD_SIZE, count=4, augment=AugmentSettings()
         ),
     )  # fmt: skip

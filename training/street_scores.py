@@ -13,6 +13,7 @@ import numpy as np
 from labeling.detection import Detections, Detector
 from labeling.fields import FieldModel
 from labeling.keypoints import KeypointHead
+from labeling.labels import Keypoints
 from training.street_pool import ObjectTruth
 
 JUDGED_HEIGHT_PX = 32.0
@@ -86,9 +87,11 @@ def judge_frame(models: StreetModels, rgb: np.ndarray, truths: tuple[ObjectTruth
                 _judge_points(models.heads[category], rgb, seen, [mine[i] for i in wanted], partner[wanted], tally)
         tally.add("count_exact", [exact])
     if models.fields is not None:
+        (objects,) = models.fields.estimate([rgb])
         lanes = tuple(truth for truth in truths if truth.category == "lane")
-        found_lanes = [item.points for item in models.fields.estimate([rgb])[0] if item.category == "lane"]
-        judge_lanes(found_lanes, lanes, tally)
+        judge_lanes([item.points for item in objects if item.category == "lane"], lanes, tally)
+        if "car24" in models.fields.schema_names:
+            judge_car_fields(objects, truths, tally)
 
 
 def match_boxes(boxes_xyxy: np.ndarray, truths: Sequence[BoxTruth]) -> tuple[np.ndarray, np.ndarray]:
@@ -183,6 +186,32 @@ def judge_lanes(found: list[np.ndarray], truths: tuple[ObjectTruth, ...], tally:
     tally.add("lane_recall", [1.0] * (len(wanted) - len(missed)) + [0.0] * len(missed))
     tally.add("lane_phantoms_per_frame", [phantoms])
     tally.add("lane_count_exact", [not missed and not phantoms])
+
+
+def judge_car_fields(found: Sequence[Keypoints], truths: tuple[ObjectTruth, ...], tally: Tally) -> None:
+    """Add one frame's outcomes to ``tally``; a car's box is that around the points that were found."""
+    found = [item for item in found if item.category == "car"]
+    cars = tuple(truth for truth in truths if truth.category == "car")
+    partner, phantoms = match_boxes(np.array([item.box_xyxy for item in found]).reshape(-1, 4), cars)
+    wanted = [index for index, truth in enumerate(cars) if is_judged(truth)]
+    tally.add("fields_car_recall", [partner[index] >= 0 for index in wanted])
+    tally.add("fields_car_phantoms_per_frame", [len(phantoms)])
+    tally.add("fields_car_count_exact", [not len(phantoms) and all(partner[index] >= 0 for index in wanted)])
+    for index in wanted:
+        match, truth = int(partner[index]), cars[index]
+        if match < 0:
+            tally.add("fields_car_pck10", np.zeros(int(truth.visible.sum())))
+        else:
+            _judge_field_points(found[match].points, truth, tally)
+
+
+def _judge_field_points(points: np.ndarray, truth: ObjectTruth, tally: Tally) -> None:
+    diagonal = float(np.hypot(*(truth.box_xyxy[2:] - truth.box_xyxy[:2])))
+    near = np.hypot(*(points[:, :2] - truth.points_xy).T) <= PCK_SHARE * diagonal
+    right = near & (points[:, 2] > 0)
+    tally.add("fields_car_pck10", right[truth.visible])
+    tally.add("fields_car_hidden_below_0.3", points[~truth.visible, 2] < HIDDEN_SCORE)
+    tally.add("fields_car_right_above_0.9", right[points[:, 2] >= SURE_SCORE])
 
 
 def distance_to_curve(points_xy: np.ndarray, curve_xy: np.ndarray) -> np.ndarray:

@@ -9,11 +9,10 @@ from labeling.detection import Detections, Detector
 from labeling.fields import FieldModel
 from labeling.labels import Keypoints
 from labeling.model_cards import CifcafCard, YoloxCard, read_card, write_card
-from training.street_field_scores import judge_car_fields
 from training.street_pool import ObjectTruth
-from training.street_scores import Tally, is_judged, judge_lanes, match_boxes
+from training.street_scores import Tally, is_judged, judge_car_fields, judge_lanes, match_boxes
 
-BOX_SCORES = tuple(float(value) for value in np.round(np.arange(0.2, 0.76, 0.05), 2))
+BOX_SCORES = tuple(float(value) for value in np.round(np.arange(0.1, 0.76, 0.05), 2))
 """Of boxes, to choose from."""
 OBJECT_SCORES = tuple(float(value) for value in np.round(np.arange(0.16, 0.45, 0.03), 2))
 """Of bottom-up objects, to choose from."""
@@ -35,7 +34,7 @@ def choose_thresholds(folder: Path, names: Sequence[str], frames: Sequence[Judge
         if isinstance(card, YoloxCard):
             card = choose_box_scores(card, folder, frames)
         elif isinstance(card, CifcafCard):
-            card = choose_object_score(card, folder, frames)
+            card = choose_object_scores(card, folder, frames)
         write_card(card, folder / f"{name}.toml")
 
 
@@ -54,19 +53,24 @@ def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFram
     return card.model_copy(update={"score_threshold": min(best.values()), "score_thresholds": best})
 
 
-def choose_object_score(card: CifcafCard, folder: Path, frames: Sequence[JudgedFrame]) -> CifcafCard:
-    """The card of one schema with the best threshold of its objects."""
-    (head,) = card.heads
-    eager = head.model_copy(update={"instance_threshold": OBJECT_SCORES[0]})
-    model = FieldModel(card.model_copy(update={"heads": (eager,)}), folder / card.file)
-    figure, judge = _FIELD_JUDGES[head.schema_name]
-    tallies = [Tally() for _ in OBJECT_SCORES]
+def choose_object_scores(card: CifcafCard, folder: Path, frames: Sequence[JudgedFrame]) -> CifcafCard:
+    """The card with the best threshold of each schema's objects."""
+    eager = [head.model_copy(update={"instance_threshold": OBJECT_SCORES[0]}) for head in card.heads]
+    model = FieldModel(card.model_copy(update={"heads": tuple(eager)}), folder / card.file)
+    tallies = [[Tally() for _ in OBJECT_SCORES] for _ in card.heads]
     for rgb, truths in frames:
         found = model.estimate([rgb])[0]
-        for threshold, tally in zip(OBJECT_SCORES, tallies, strict=True):
-            judge([item for item in found if item.score >= threshold], truths, tally)
-    best = best_threshold(np.array([tally.figures()[figure] for tally in tallies]), OBJECT_SCORES)
-    return card.model_copy(update={"heads": (head.model_copy(update={"instance_threshold": best}),)})
+        for head, mine in zip(card.heads, tallies, strict=True):
+            judge = _FIELD_JUDGES[head.schema_name][1]
+            for threshold, tally in zip(OBJECT_SCORES, mine, strict=True):
+                judge(
+                    [one for one in found if one.schema == head.schema_name and one.score >= threshold], truths, tally
+                )
+    heads = []
+    for head, mine in zip(card.heads, tallies, strict=True):
+        shares = np.array([tally.figures()[_FIELD_JUDGES[head.schema_name][0]] for tally in mine])
+        heads.append(head.model_copy(update={"instance_threshold": best_threshold(shares, OBJECT_SCORES)}))
+    return card.model_copy(update={"heads": tuple(heads)})
 
 
 def _judge_lanes(found: Sequence[Keypoints], truths: tuple[ObjectTruth, ...], tally: Tally) -> None:

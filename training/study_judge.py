@@ -140,7 +140,8 @@ class Judge:
 
 def new_networks(width: int, height: int, *, seed: int) -> tuple[StreetDetector, PairNetwork]:
     """Untrained."""
-    detector = seeded(lambda: StreetDetector(1, widths=(24, 32, 48, 64), width=32), seed=seed)
+    shape = {"widths": (24, 32, 48, 64), "depths": (1, 1, 1), "width": 32, "towers": (True, True, True)}
+    detector = seeded(lambda: StreetDetector(1, **shape), seed=seed)
     return detector, seeded(lambda: PairNetwork(width, height), seed=seed)
 
 
