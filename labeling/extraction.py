@@ -23,7 +23,7 @@ from labeling.labels import Keypoints
 from labeling.observation import Look, looks_of
 from labeling.picture_turn import picture_turn, turn_view
 from labeling.smoothing import smooth_tracks
-from labeling.tracking import RunTracker, TrackerSettings, drop_passing_tracks
+from labeling.tracking import RunTracker, drop_passing_tracks
 
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
@@ -139,7 +139,7 @@ class _Channel:
         self.look, self.settings = look, settings
         self.labels: list[Keypoints] = []
         self.looks = 0
-        self._tracker = RunTracker(TrackerSettings(high_score=look.sure_score))
+        self._tracker = RunTracker(sure_scores=look.sure_scores)
         self._forget()
 
     def _forget(self) -> None:

@@ -41,6 +41,10 @@ Dimensions = tuple[int | None, ...]
 """A tensor's shape as a card states it; ``None`` (the batch) may be anything."""
 
 
+DEFAULT_SURE_SCORE = 0.5
+"""At which a detected object may begin a track (Zhang et al. 2022, ByteTrack)."""
+
+
 class ModelCard(BaseModel, frozen=True, extra="forbid", populate_by_name=True):
     """What every extractor's card states. The subclasses add what their kind needs."""
 
@@ -90,16 +94,19 @@ class YoloxCard(ModelCard, frozen=True):
     score_threshold: float = Field(default=0.3, gt=0, lt=1)
     score_thresholds: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=dict)
     """Class name to a threshold of its own, in place of ``score_threshold``."""
+    sure_scores: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=dict)
+    """Class name to the least score at which an object may begin a track; 0.5 where nothing is said."""
     nms_threshold: float = Field(default=0.45, gt=0, le=1)
     max_detections: int = Field(default=200, gt=0)
     """The best of a frame; how many more there were is said in ``Detections.left_out``."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "YoloxCard":
-        unknown = {*self.categories, *self.score_thresholds} - set(self.class_names)
+        unknown = {*self.categories, *self.score_thresholds, *self.sure_scores} - set(self.class_names)
         if unknown:
             raise ValueError(
-                f"categories or score_thresholds name classes that the model does not have: {sorted(unknown)}"
+                "categories, score_thresholds or sure_scores name classes that the model does not have: "
+                f"{sorted(unknown)}"
             )
         if self.input_width % 32 or self.input_height % 32:
             raise ValueError(f"a yolox input must be a multiple of 32, got {self.input_width}x{self.input_height}")
@@ -114,6 +121,14 @@ class YoloxCard(ModelCard, frozen=True):
     def class_thresholds(self) -> tuple[float, ...]:
         """C least scores in the order of the output."""
         return tuple(self.score_thresholds.get(name, self.score_threshold) for name in self.class_names)
+
+    @property
+    def category_sure_scores(self) -> dict[Category, float]:
+        """The least score at which an object of each category may begin a track: that of its most trusted class."""
+        scores: dict[Category, float] = {}
+        for name, category in self.categories.items():
+            scores[category] = min(scores.get(category, 1.0), self.sure_scores.get(name, DEFAULT_SURE_SCORE))
+        return scores
 
     def output_shapes(self) -> dict[str, Dimensions]:
         """One output: a row of box, objectness and class scores per grid cell."""

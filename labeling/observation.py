@@ -1,6 +1,6 @@
 """What the networks see in one frame: detection with keypoint heads, and bottom-up fields."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -15,13 +15,17 @@ _BOX_SCHEMA: dict[Category, str] = {"car": "car24", "person": "coco17"}
 """The schema of an object whose keypoints no network gives: a box with absent points still has a track."""
 
 
+_SURE_OBJECT_SCORE = 0.25
+"""A mean over all points, hidden ones too: a car seen whole scores about 0.5, one half seen about 0.3."""
+
+
 class Look(Protocol):
     """Something that tells what is in a frame."""
 
     carries: bool
     """Whether the points it gives lie on things that optical flow can follow."""
-    sure_score: float
-    """Objects that score at least this may start a track."""
+    sure_scores: Mapping[Category, float]
+    """Objects of each category that score at least this may begin a track."""
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """Untracked labels of an (H, W, 3) uint8 RGB frame, numbered ``number``."""
@@ -55,10 +59,11 @@ class ObjectLook:
     """Boxes of a detector, with the points of the heads in them."""
 
     carries = True
-    sure_score = 0.5
 
     def __init__(self, extractors: Extractors, categories: Sequence[Category]) -> None:
+        assert extractors.detector is not None
         self.extractors, self.categories = extractors, categories
+        self.sure_scores = extractors.detector.card.category_sure_scores
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""
@@ -91,12 +96,10 @@ class ObjectLook:
 class FieldLook:
     """Objects of a bottom-up network."""
 
-    # A mean over all points, hidden ones too: a car seen whole scores about 0.5, one half seen about 0.3.
-    sure_score = 0.25
-
     def __init__(self, model: FieldModel, categories: Sequence[Category]) -> None:
         self.model, self.categories = model, categories
         self.carries = list(categories) != ["lane"]
+        self.sure_scores = dict.fromkeys(categories, _SURE_OBJECT_SCORE)
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""

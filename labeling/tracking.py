@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from labeling.labels import POINT_DETECTED, UNTRACKED, Keypoints
+from labeling.schemas import Category
 
 _UNMATCHED = 1.0
 """Cost of a box or a track that is left alone: what a match of no overlap would cost. Were it more, a whole row of
@@ -174,11 +175,18 @@ class BoxTracker:
 
 
 class RunTracker:
-    """Ids for all categories of a run: they count from 0 in the order in which objects appear."""
+    """Ids for all categories of a run: they count from 0 in the order in which objects appear.
 
-    def __init__(self, settings: TrackerSettings | None = None) -> None:
-        self._settings = settings
-        self._trackers: dict[str, BoxTracker | LaneTracker] = {}
+    Args:
+        settings: of every category.
+        sure_scores: a ``high_score`` of its own for each category, in place of the settings'.
+    """
+
+    def __init__(
+        self, settings: TrackerSettings | None = None, *, sure_scores: Mapping[Category, float] | None = None
+    ) -> None:
+        self._settings, self._sure_scores = settings or TrackerSettings(), dict(sure_scores or {})
+        self._trackers: dict[Category, BoxTracker | LaneTracker] = {}
         self._next_id = 0
         self._frame: int | None = None
 
@@ -212,15 +220,19 @@ class RunTracker:
         out: list[Keypoints] = []
         for category in sorted({label.category for label in labels} | set(self._trackers)):
             group = [label for label in labels if label.category == category]
-            tracker = self._trackers.get(category) or (
-                LaneTracker() if category == "lane" else BoxTracker(self._settings)
-            )
+            tracker = self._trackers.get(category) or self._new_tracker(category)
             self._trackers[category] = tracker
             tracker.next_id = self._next_id
             ids = _update(tracker, group, step, previous_to_current, carried)
             self._next_id = tracker.next_id
             out += [replace(label, track_id=int(i)) for label, i in zip(group, ids, strict=True) if i != UNTRACKED]
         return out
+
+    def _new_tracker(self, category: Category) -> "BoxTracker | LaneTracker":
+        if category == "lane":
+            return LaneTracker()
+        sure = self._sure_scores.get(category, self._settings.high_score)
+        return BoxTracker(replace(self._settings, high_score=sure))
 
 
 def assign_tracks(

@@ -5,7 +5,7 @@ only what makes tracks of them is timed and judged.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -42,7 +42,6 @@ _SEED = HELD_OUT_SEED + 200
 _GREEDY_IOU = 0.3
 _LEAST_MS = 0.01
 """The axis is logarithmic: what costs nothing is drawn there."""
-_SURE = 0.5
 _LEG_POINTS = (13, 14, 15, 16)
 """Knees and ankles of ``coco17``."""
 
@@ -53,18 +52,19 @@ class TrackClip:
 
     clip: KeypointClip
     looks: tuple[tuple[Keypoints, ...], ...]
+    sure_scores: Mapping[Category, float]
+    """Of the detector that looked."""
 
     def look(self) -> Look:
         """The same looks again, at no cost."""
-        return _Remembered(self.looks)
+        return _Remembered(self)
 
 
 class _Remembered:
     carries = True
-    sure_score = _SURE
 
-    def __init__(self, looks: Sequence[Sequence[Keypoints]]) -> None:
-        self.looks = looks
+    def __init__(self, clip: TrackClip) -> None:
+        self.looks, self.sure_scores = clip.looks, clip.sure_scores
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         return list(self.looks[number])
@@ -109,12 +109,13 @@ def track_clips(*, quick: bool = False) -> list[TrackClip]:
 def look_at(clip: KeypointClip) -> TrackClip:
     """Cars and people as the shipped models see them in every frame."""
     look = looks_of(street_extractors())[0]
-    return TrackClip(clip=clip, looks=tuple(tuple(look.see(frame, n)) for n, frame in enumerate(clip.frames)))
+    looks = tuple(tuple(look.see(frame, n)) for n, frame in enumerate(clip.frames))
+    return TrackClip(clip=clip, looks=looks, sure_scores=look.sure_scores)
 
 
 def without_ids(clip: TrackClip) -> list[Keypoints]:
     """Everything seen is somebody new."""
-    seen = (label for labels in clip.looks for label in labels if label.score >= _SURE)
+    seen = (label for labels in clip.looks for label in labels if label.score >= clip.sure_scores[label.category])
     return [replace(label, track_id=n) for n, label in enumerate(seen)]
 
 
@@ -124,7 +125,7 @@ def greedy_overlap(clip: TrackClip) -> list[Keypoints]:
     before: list[Keypoints] = []
     next_id = 0
     for labels in clip.looks:
-        seen = [label for label in labels if label.score >= _SURE]
+        seen = [label for label in labels if label.score >= clip.sure_scores[label.category]]
         boxes = [np.array([one.box_xyxy for one in group]).reshape(-1, 4) for group in (before, seen)]
         overlap = iou(boxes[0], boxes[1])
         for row, old in enumerate(before):
@@ -144,7 +145,7 @@ def greedy_overlap(clip: TrackClip) -> list[Keypoints]:
 
 def tracked(clip: TrackClip, *, turns: bool = True, settings: TrackerSettings | None = None) -> list[Keypoints]:
     """Our tracker at every frame, with or without the camera's turn; raw points."""
-    tracker, view, found = RunTracker(settings or TrackerSettings(high_score=_SURE)), None, []
+    tracker, view, found = RunTracker(settings, sure_scores=clip.sure_scores), None, []
     for number, (frame, labels) in enumerate(zip(clip.clip.frames, clip.looks, strict=True)):
         before, view = view, turn_view(frame) if turns else None
         height, width = frame.shape[:2]
@@ -165,8 +166,8 @@ def labelled(clip: TrackClip, *, effort: EffortSettings) -> list[Keypoints]:
     return label_with([clip.look()], clip.clip.frames, first_frame=0, effort=effort)
 
 
-_SINGLE = TrackerSettings(high_score=_SURE, buffer=0.0, lost_buffer=0.0)
-_FORGETFUL = TrackerSettings(high_score=_SURE, max_lost_frames=1)
+_SINGLE = TrackerSettings(buffer=0.0, lost_buffer=0.0)
+_FORGETFUL = TrackerSettings(max_lost_frames=1)
 METHODS: dict[str, Method] = {
     "no ids": without_ids,
     "greedy overlap": greedy_overlap,

@@ -1,9 +1,12 @@
 """A textured card that moves over a textured wall and knows where its points are: a scene for what carries points."""
 
+from collections.abc import Mapping
+
 import cv2
 import numpy as np
 
 from labeling.labels import POINT_DETECTED, Keypoints
+from labeling.schemas import Category
 
 WIDTH, HEIGHT = 320, 224
 
@@ -17,7 +20,7 @@ class MovingCard:
     """A textured card that slides and grows over a textured wall; it knows where its 24 points are in every frame."""
 
     carries = True
-    sure_score = 0.5
+    sure_scores: Mapping[Category, float] = {"car": 0.5}
 
     def __init__(
         self, *, speed: float = 2.0, growth: float = 0.0, cut: int | None = None, shown: range = range(999)

@@ -7,7 +7,7 @@ from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
 from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, plan_lessons, plan_streets
 from training.street_pool import ObjectTruth
 from training.street_scores import Tally, judge_car_fields
-from training.street_thresholds import BOX_SCORES, best_threshold, counts_exactly
+from training.street_thresholds import BOX_SCORES, best_threshold, judge_count, sure_threshold
 
 
 def car(left: float, *, height: float = 60.0, share: float = 1.0) -> ObjectTruth:
@@ -43,9 +43,16 @@ def bottom_up(truth: ObjectTruth, *, off_px: float = 0.0) -> Keypoints:
 def test_counts_are_exact_where_all_judged_objects_and_nothing_else_is_found() -> None:
     truths = [car(0), car(200), car(400, height=20), car(600, share=0.2)]
     found = detections([*truths, car(800)], [0.9, 0.5, 0.5, 0.5, 0.4])
-    assert counts_exactly(found, truths, 0.45), "objects that are not judged may be found"
-    assert not counts_exactly(found, truths, 0.6), "one is missed"
-    assert not counts_exactly(found, truths, 0.3), "one is not there"
+    assert judge_count(found, truths, 0.45) == (0, 0), "objects that are not judged may be found"
+    assert judge_count(found, truths, 0.6) == (1, 0), "one is missed"
+    assert judge_count(found, truths, 0.3) == (0, 1), "one is not there"
+
+
+def test_a_track_may_begin_where_phantoms_are_few() -> None:
+    falling = np.linspace(0.2, 0.0, len(BOX_SCORES))
+    chosen = BOX_SCORES.index(sure_threshold(falling, BOX_SCORES))
+    assert falling[chosen] <= 0.02 < falling[chosen - 1]
+    assert sure_threshold(falling + 0.1, BOX_SCORES) == BOX_SCORES[-1]
 
 
 def test_the_middle_of_a_plateau_beats_a_lone_peak() -> None:

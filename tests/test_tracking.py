@@ -109,6 +109,12 @@ def test_unsure_boxes_continue_a_track_but_start_none() -> None:
     assert first == second
 
 
+def test_each_category_may_be_sure_at_a_score_of_its_own() -> None:
+    for sure, begun in ((0.95, 0), (0.85, 1)):
+        tracker = RunTracker(sure_scores={"car": sure})
+        assert len(tracker.update([car(0, 100)], frame=0)) == begun
+
+
 def test_frame_steps_scale_the_prediction() -> None:
     every, fourth = BoxTracker(), BoxTracker()
     dense = [every.update(box(50 + 5 * t)[None], np.ones(1))[0] for t in range(40)]

@@ -101,8 +101,8 @@ class DetectorBatches:
         boxes = [truth.box_xyxy for truth in frame.objects if truth.category == category and truth.visible_share > 0.2]
         if not boxes or rng.random() < 0.25:
             return None
-        # Large objects are few: the root of the height evens them out.
-        weights = np.sqrt([box[3] - box[1] for box in boxes])
+        # Near objects are few, near people fewest: a crowd on the pavement would leave them no window.
+        weights = np.array([box[3] - box[1] for box in boxes]) ** (1.0 if category == "person" else 0.5)
         box = boxes[int(rng.choice(len(boxes), p=weights / weights.sum()))]
         return (box[:2] + box[2:]) / 2 * frame.scale
 

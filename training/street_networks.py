@@ -157,16 +157,21 @@ class SimccNetwork(nn.Module):
 
 
 class SimccGraph(nn.Module):
-    """``SimccNetwork`` as the ``simcc`` contract wants it: both maxima are the probability that the point is seen."""
+    """``SimccNetwork`` as the ``simcc`` contract wants it: both maxima are the probability that the point is seen.
 
-    def __init__(self, network: SimccNetwork) -> None:
+    Args:
+        network: trained.
+        shift: added to the logits of that probability.
+    """
+
+    def __init__(self, network: SimccNetwork, *, shift: float = 0.0) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.shift = network, shift
 
     def forward(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """``simcc_x`` (N, K, 2 W) and ``simcc_y`` (N, K, 2 H), each at most the visibility, which its maximum is."""
         along_x, along_y, seen = self.network(crops)
-        visible = seen.sigmoid().unsqueeze(2)
+        visible = (seen + self.shift).sigmoid().unsqueeze(2)
         return visible * _peak_one(along_x), visible * _peak_one(along_y)
 
 

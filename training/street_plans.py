@@ -15,8 +15,11 @@ PLANNED: tuple[Scenario, ...] = (
     "traffic", "lead_leaves", "parked", "fast", "sharp_turn", "reverse", "empty", "wall", "road_only", "still",
 )  # fmt: skip
 """Scenarios in turn; busy ones come more often."""
-_LEARNT: tuple[Scenario, ...] = (*PLANNED, "cross_traffic", "cross_traffic", "stop_and_go", "cross_traffic")
-"""Scenarios in turn for learners: cars are seldom seen from the side, and near ones least of all."""
+_LEARNT: tuple[Scenario, ...] = (
+    *PLANNED, "cross_traffic", "crossing", "stop_and_go", "crossing", "cross_traffic", "crossing", "cross_traffic",
+    "crossing",
+)  # fmt: skip
+"""Scenarios in turn for learners: cars and people are seldom seen from the side, and near ones least of all."""
 _WALKERS = (None, 10.0, 20.0, 30.0)
 """People per 100 m that learners see: streets have few, and half of what is to be learnt is people."""
 _DESERTED: tuple[Scenario, ...] = ("empty", "wall", "road_only")

@@ -17,6 +17,8 @@ BOX_SCORES = tuple(float(value) for value in np.round(np.arange(0.1, 0.76, 0.05)
 OBJECT_SCORES = tuple(float(value) for value in np.round(np.arange(0.16, 0.45, 0.03), 2))
 """Of bottom-up objects, to choose from."""
 _LUCK = 0.015
+_FEW_PHANTOMS = 0.02
+"""Per frame and class: what a track may begin with. One phantom that is believed is shown for as long as it lasts."""
 JudgedFrame = tuple[np.ndarray, tuple[ObjectTruth, ...]]
 """(H, W, 3) uint8 RGB, and what is true in it."""
 
@@ -39,18 +41,24 @@ def choose_thresholds(folder: Path, names: Sequence[str], frames: Sequence[Judge
 
 
 def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFrame]) -> YoloxCard:
-    """The card with the best threshold of each class; each is chosen by its own class's counts."""
+    """The card with the best threshold of each class, chosen by its own class's counts, and with its sure score."""
     eager = card.model_copy(update={"score_threshold": BOX_SCORES[0], "score_thresholds": {}})
     detector = Detector(eager, folder / card.file)
     exact: dict[str, list[list[bool]]] = {name: [] for name in card.class_names}
+    phantoms: dict[str, list[list[int]]] = {name: [] for name in card.class_names}
     for rgb, truths in frames:
         found = detector.detect([rgb])[0]
-        for name, rows in exact.items():
+        for name in card.class_names:
             seen = found.select(found.classes == name)
             mine = [truth for truth in truths if truth.category == card.categories[name]]
-            rows.append([counts_exactly(seen, mine, threshold) for threshold in BOX_SCORES])
+            judged = [judge_count(seen, mine, threshold) for threshold in BOX_SCORES]
+            exact[name].append([missed + extra == 0 for missed, extra in judged])
+            phantoms[name].append([extra for _, extra in judged])
     best = {name: best_threshold(np.mean(rows, axis=0), BOX_SCORES) for name, rows in exact.items()}
-    return card.model_copy(update={"score_threshold": min(best.values()), "score_thresholds": best})
+    sure = {name: max(best[name], sure_threshold(np.mean(rows, axis=0), BOX_SCORES)) for name, rows in phantoms.items()}
+    return card.model_copy(
+        update={"score_threshold": min(best.values()), "score_thresholds": best, "sure_scores": sure}
+    )
 
 
 def choose_object_scores(card: CifcafCard, folder: Path, frames: Sequence[JudgedFrame]) -> CifcafCard:
@@ -83,11 +91,22 @@ _FIELD_JUDGES: dict[str, tuple[str, Callable[[Sequence[Keypoints], tuple[ObjectT
 }
 
 
-def counts_exactly(found: Detections, truths: Sequence[ObjectTruth], threshold: float) -> bool:
-    """Whether the detections above a score are all the objects that are judged, and no phantom."""
+def judge_count(found: Detections, truths: Sequence[ObjectTruth], threshold: float) -> tuple[int, int]:
+    """How many objects that are judged the detections above a score miss, and how many phantoms are among them."""
     partner, phantoms = match_boxes(found.boxes_xyxy[found.scores > threshold], truths)
-    missed = any(at < 0 and is_judged(truth) for at, truth in zip(partner, truths, strict=True))
-    return not missed and not len(phantoms)
+    missed = sum(at < 0 and is_judged(truth) for at, truth in zip(partner, truths, strict=True))
+    return missed, len(phantoms)
+
+
+def sure_threshold(phantoms_per_frame: np.ndarray, candidates: Sequence[float]) -> float:
+    """The lowest candidate above which phantoms are few; the highest where they never are.
+
+    Args:
+        phantoms_per_frame: (n,) one per candidate.
+        candidates: n values, rising.
+    """
+    few = np.flatnonzero(phantoms_per_frame <= _FEW_PHANTOMS)
+    return candidates[int(few[0])] if len(few) else candidates[-1]
 
 
 def best_threshold(shares: np.ndarray, candidates: Sequence[float]) -> float:
