@@ -19,6 +19,8 @@ LETTERBOX_GREY = 114
 STRIDES = (8, 16, 32)
 _MAX_CANDIDATES = 2000
 """Pairs of box and class that enter the suppression, best first: it bounds the time of the worst frame."""
+DOUBLE_IOU = 0.45
+"""Two boxes of one category that overlap by more are one object (YOLOX's own threshold)."""
 _MIN_SIDE_PX = 1e-3
 
 
@@ -47,7 +49,7 @@ class Detections:
             categories=self.categories[keep], left_out=self.left_out,
         )  # fmt: skip
 
-    def distinct(self, iou_threshold: float = 0.45) -> "Detections":
+    def distinct(self, iou_threshold: float = DOUBLE_IOU) -> "Detections":
         """Without those that a better one of the same category overlaps: a van seen as car and as truck is one object.
 
         Classes without a category are left as they are.

@@ -17,6 +17,7 @@ import numpy as np
 
 from labeling.between_looks import BetweenLooks
 from labeling.carrying import small_grey
+from labeling.detection import DOUBLE_IOU, suppress_overlaps
 from labeling.efforts import EFFORTS, Effort, EffortSettings, Rhythm
 from labeling.extractors import Extractors
 from labeling.labels import Keypoints
@@ -27,7 +28,7 @@ from labeling.tracking import RunTracker, drop_passing_tracks
 
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
-"""What lasts less than a quarter of a second, or was seen once, is taken for a mistake."""
+"""What lasts less than a quarter of a second, or was surely seen only once, is taken for a mistake."""
 _SAMPLE, _SAME_LEVELS = 16, 2
 """Every so many pixels are compared before all are; and by how many levels they may differ."""
 _TURN_STEP = 4
@@ -86,8 +87,28 @@ def label_with(
         channel.finish()
     labels = _renumbered([channel.labels for channel in channels])
     fresh = frozenset(moment for moment, number in enumerate(moments) if number in breaks)
-    labels = _on_grid(smooth_tracks(labels, breaks=fresh), shown, first_frame=first_frame)
-    return drop_passing_tracks(labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES)
+    labels = _on_grid(without_doubles(smooth_tracks(labels, breaks=fresh)), shown, first_frame=first_frame)
+    sure_scores = {category: score for channel in channels for category, score in channel.look.sure_scores.items()}
+    return drop_passing_tracks(labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES, sure_scores=sure_scores)
+
+
+def without_doubles(labels: Iterable[Keypoints]) -> list[Keypoints]:
+    """Labels of which none is covered by a better one of its category in the same frame.
+
+    A detector's boxes never cover each other so; what is carried or smoothed on while something steps before it does.
+    """
+    groups: dict[tuple[int, str], list[Keypoints]] = {}
+    for label in labels:
+        groups.setdefault((label.frame, label.category), []).append(label)
+    kept: list[Keypoints] = []
+    for (_, category), group in groups.items():
+        if category == "lane" or len(group) < 2:
+            kept += group
+            continue
+        ordered = sorted(group, key=lambda label: -label.score)
+        boxes = np.stack([label.box_xyxy for label in ordered])
+        kept += [ordered[i] for i in suppress_overlaps(boxes, np.zeros(len(boxes)), DOUBLE_IOU)]
+    return sorted(kept, key=lambda label: (label.frame, label.track_id))
 
 
 def same_picture(picture: np.ndarray, other: np.ndarray) -> bool:

@@ -257,16 +257,30 @@ def assign_tracks(
     return tracked
 
 
-def drop_passing_tracks(labels: Sequence[Keypoints], *, min_looks: int, min_frames: int) -> list[Keypoints]:
-    """Without a network's mistakes: tracks of fewer than ``min_looks`` looks or ``min_frames`` frames.
+def drop_passing_tracks(
+    labels: Sequence[Keypoints],
+    *,
+    min_looks: int,
+    min_frames: int,
+    sure_scores: Mapping[Category, float] | None = None,
+) -> list[Keypoints]:
+    """Without a network's mistakes: tracks of fewer than ``min_looks`` sure looks or ``min_frames`` frames.
 
     What flow carried or a neighbour lent does not count as a look; an object without keypoints counts by its box.
+
+    Args:
+        labels: tracked.
+        min_looks: how often it must have been seen, and be sure.
+        min_frames: from its first frame to its last.
+        sure_scores: by category, the score from which a look is sure; any score where nothing is said.
     """
+    sure_scores = sure_scores or {}
     looks: dict[int, int] = {}
     frames: dict[int, list[int]] = {}
     for label in labels:
         seen = not label.present.any() or (label.point_source == POINT_DETECTED).any()
-        looks[label.track_id] = looks.get(label.track_id, 0) + bool(seen)
+        sure = label.score >= sure_scores.get(label.category, 0.0)
+        looks[label.track_id] = looks.get(label.track_id, 0) + bool(seen and sure)
         frames.setdefault(label.track_id, []).append(label.frame)
     return [
         label

@@ -10,7 +10,7 @@ from moving_card import HEIGHT, WIDTH, MovingCard, texture
 from labeling.carrying import carry, close_gap, interpolate_gap, small_grey
 from labeling.efforts import EFFORTS, Effort, straight_gap
 from labeling.errors import ConfigError, ModelError
-from labeling.extraction import label_with, same_picture
+from labeling.extraction import label_with, same_picture, without_doubles
 from labeling.extractors import choose_extractors
 from labeling.labels import POINT_CARRIED, POINT_DETECTED, POINT_INTERPOLATED, Keypoints
 
@@ -68,6 +68,19 @@ def test_a_picture_shown_again_is_the_same_moment(effort: Effort) -> None:
     for label, moment in zip(held, order, strict=True):
         np.testing.assert_array_equal(label.points, labels[moment].points)
         np.testing.assert_array_equal(label.point_source, labels[moment].point_source)
+
+
+def test_no_label_is_covered_by_a_better_one_of_its_kind() -> None:
+    card = MovingCard()
+    first, far = (
+        replace(card.label(3), track_id=0),
+        replace(card.label(3), track_id=2, box_xyxy=np.array([200.0, 70, 296, 142], np.float32)),
+    )
+    over = replace(first, track_id=1, score=0.5, box_xyxy=first.box_xyxy + 10)
+    other = replace(over, category="person", track_id=3)
+    later = replace(over, frame=4)
+    kept = without_doubles([over, first, far, other, later])
+    assert [(label.frame, label.track_id) for label in kept] == [(3, 0), (3, 2), (3, 3), (4, 1)]
 
 
 def test_what_a_coder_changes_is_the_same_picture_and_noise_is_not() -> None:

@@ -1,6 +1,7 @@
 """Track ids on made-up motion whose right answer is known."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -153,6 +154,14 @@ def test_passing_tracks_are_dropped_and_only_they() -> None:
     kept = drop_passing_tracks(tracked, min_looks=2, min_frames=6)
     assert [label.frame for label in kept] == list(range(10))
     assert drop_passing_tracks(tracked, min_looks=1, min_frames=1) == tracked
+
+
+def test_a_track_that_was_sure_only_once_is_dropped() -> None:
+    frames = [[replace(car(t, 100), score=0.9 if t in sure else 0.4)] for sure in ((0,), (0, 5)) for t in range(10)]
+    for part, kept in ((frames[:10], 0), (frames[10:], 10)):
+        tracked = [label for labels in assign_tracks(part) for label in labels]
+        assert len(drop_passing_tracks(tracked, min_looks=2, min_frames=6, sure_scores={"car": 0.5})) == kept
+        assert drop_passing_tracks(tracked, min_looks=2, min_frames=6) == tracked
 
 
 def lane(offset: float) -> np.ndarray:
