@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 
 from dataset.street import Scenario
+from labeling.box_tracker import TrackerSettings, iou
 from labeling.efforts import EFFORTS, EffortSettings
 from labeling.extraction import label_with
 from labeling.labels import Keypoints
@@ -19,7 +20,7 @@ from labeling.observation import Look, looks_of
 from labeling.picture_turn import picture_turn, turn_view
 from labeling.schemas import Category
 from labeling.smoothing import smooth_tracks
-from labeling.tracking import RunTracker, TrackerSettings, iou
+from labeling.tracking import RunTracker
 from pipelines.charts import Chart, ChartPoint, Cost, Error, machine_name
 from pipelines.charts_keypoints import fixed_rhythm
 from pipelines.keypoint_clips import (

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
+from labeling.box_tracker import iou
 from labeling.camera import Intrinsics
 from labeling.detection import Detector
 from labeling.ego_motion import estimate_ego_motion
@@ -12,7 +13,6 @@ from labeling.labels import Keypoints
 from labeling.model_cards import YoloxCard, find_weights, load_cards
 from labeling.skeleton_reading import skeletons_from_frame
 from labeling.skeleton_video import draw_skeletons
-from labeling.tracking import iou
 from pipelines.study_data import StudyClip
 from training.metrics import ade_m
 from training.study_judge import is_counted

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from dataset.street_labels import StreetObject
+from labeling.box_tracker import iou
 from labeling.labels import Keypoints
 from labeling.schemas import Category
-from labeling.tracking import iou
 from pipelines.keypoint_errors import BODIES, MatchedFrame, by_frame
 from training.street_scores import box_overlaps, is_excused, is_judged
 

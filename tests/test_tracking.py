@@ -7,16 +7,10 @@ from itertools import product
 import numpy as np
 import pytest
 
+from labeling.box_tracker import BoxTracker, iou
 from labeling.labels import UNTRACKED, Keypoints
-from labeling.tracking import (
-    BoxTracker,
-    LaneTracker,
-    RunTracker,
-    assign_tracks,
-    drop_passing_tracks,
-    iou,
-    line_distance,
-)
+from labeling.lane_tracker import LaneTracker, line_distance
+from labeling.tracking import RunTracker, assign_tracks, drop_passing_tracks
 
 
 def box(x: float, y: float = 300, *, width: float = 40, height: float = 100) -> np.ndarray:
