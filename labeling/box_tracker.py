@@ -20,6 +20,10 @@ _PAST_FRAMES = 36
 """Frames over which a track remembers where it was seen."""
 _LEVER_FRAMES = 8
 """Two sightings tell a speed when they are at least so far apart: boxes shake, and a walker's swings with the legs."""
+_SLOW_PX = 0.5
+"""Per frame: what is slower has no direction."""
+_WHOLE_SHARE = 0.75
+"""A box of less than this share of its usual width or height shows a part: the picture's border or a column cuts it."""
 _STEADY_GROWTH = 0.01
 """Share by which the height of what comes neither nearer nor goes may change per frame: such objects move evenly."""
 
@@ -36,6 +40,8 @@ class TrackerSettings:
     """The same for tracks that have not been seen for a while: their prediction is less sure."""
     lost_cost: float = 0.1
     """Added to what it costs to match a lost track: between equals, the one that was just seen goes first."""
+    back_cost: float = 0.5
+    """Added for a lost track that would have had to turn back by its own size: people come out where they went to."""
     min_overlap: float = 0.15
     """Least IoU of the buffered boxes."""
     max_lost_frames: int = 36
@@ -118,7 +124,8 @@ class BoxTracker:
         for index in high:
             ids[index] = self._start(boxes[index])
         for track in seen:
-            if track.lost_frames and track.track_id not in (carried or {}):
+            # Even where flow holds it: flow may hold the edge of what hides it.
+            if track.lost_frames:
                 _coast(track)
         self._tracks = [track for track in self._tracks if track.lost_frames <= self.settings.max_lost_frames]
         return ids
@@ -139,7 +146,8 @@ class BoxTracker:
         overlap = np.where(lost, far, near)
         heights = np.log(_heights(boxes[chosen])[None] / _heights(predicted)[:, None])
         allowed = (overlap >= settings.min_overlap) & (np.abs(heights) <= np.log(settings.max_size_ratio))
-        cost = np.minimum(1 - overlap + settings.lost_cost * lost, _UNMATCHED)
+        back = np.stack([_turned_back(track, boxes[chosen]) for track in tracks])
+        cost = np.minimum(1 - overlap + lost * (settings.lost_cost + settings.back_cost * back), _UNMATCHED)
         rows, columns = linear_sum_assignment(np.where(allowed, cost, _UNMATCHED))
         taken = np.zeros(len(chosen), bool)
         for row, column in zip(rows, columns, strict=True):
@@ -175,6 +183,16 @@ def iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
     return shared / np.maximum(area_a[:, None] + area_b[None] - shared, 1e-9)
 
 
+def _turned_back(track: _Track, boxes_xyxy: np.ndarray) -> np.ndarray:
+    """(N,) by how much of its size each of (N, 4) boxes lies behind where a track is expected, against its motion."""
+    (centre, velocity), size = track.mean[:2].T, np.exp(np.clip(track.mean[2:, 0], -3, 9))
+    speed = float(np.hypot(*velocity))
+    if speed < _SLOW_PX:
+        return np.zeros(len(boxes_xyxy))
+    ahead = ((boxes_xyxy[:, :2] + boxes_xyxy[:, 2:]) / 2 - centre) @ velocity / speed
+    return np.clip(-ahead / size.min(), 0, 1)
+
+
 def _grown(boxes_xyxy: np.ndarray, buffer: float) -> np.ndarray:
     margin = (boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]) * buffer
     return np.concatenate([boxes_xyxy[:, :2] - margin, boxes_xyxy[:, 2:] + margin], axis=1)
@@ -208,7 +226,9 @@ def _coast(track: _Track) -> None:
     Its last boxes are what was left in view: their middle stops at the edge of what hides it. The line through most
     sightings does not (Theil 1950, Sen 1968: the median of the slopes of pairs, of which three in ten may be wrong).
     """
-    ago, places = -track.past[:, 0], track.past[:, 1:]
+    usual = np.median(track.past[:, 3:], axis=0)
+    whole = (track.past[:, 3:] >= usual + np.log(_WHOLE_SHARE)).all(axis=1)
+    ago, places = -track.past[whole, 0], track.past[whole, 1:]
     first, second = np.triu_indices(len(ago), 1)
     apart = ago[second] - ago[first]
     far = apart >= _LEVER_FRAMES
