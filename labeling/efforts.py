@@ -36,13 +36,22 @@ class EffortSettings:
     quiet_frames: int = 24
     """A network that has seen nothing for so long looks only every ``quiet_gap`` frames."""
     quiet_gap: int = 12
+    sure_looks: int = 2
+    """Looks that must be sure of an object for it to be believed; where they are rare, one must do."""
 
 
 EFFORTS: dict[Effort, EffortSettings] = {
     "exact": EffortSettings(max_gap=1, max_person_gap=1, max_lane_gap=1, flow_step=0, quiet_gap=1),
     "balanced": EffortSettings(max_gap=8, max_person_gap=5, max_lane_gap=12, news_gap=4, flow_step=2, max_miss=0.04),
     "fast": EffortSettings(
-        max_gap=12, max_person_gap=12, max_lane_gap=12, news_gap=12, flow_step=4, max_bend=0.05, max_miss=0.08
+        max_gap=12,
+        max_person_gap=12,
+        max_lane_gap=12,
+        news_gap=12,
+        flow_step=4,
+        max_bend=0.05,
+        max_miss=0.08,
+        sure_looks=1,
     ),
 }
 

@@ -28,7 +28,7 @@ from labeling.tracking import RunTracker, drop_passing_tracks
 
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
-"""What lasts less than a quarter of a second, or was surely seen only once, is taken for a mistake."""
+"""What lasts less than a quarter of a second, or was seen once, is taken for a mistake."""
 _SAMPLE, _SAME_LEVELS = 16, 2
 """Every so many pixels are compared before all are; and by how many levels they may differ."""
 _TURN_STEP = 4
@@ -89,7 +89,9 @@ def label_with(
     fresh = frozenset(moment for moment, number in enumerate(moments) if number in breaks)
     labels = _on_grid(without_doubles(smooth_tracks(labels, breaks=fresh)), shown, first_frame=first_frame)
     sure_scores = {category: score for channel in channels for category, score in channel.look.sure_scores.items()}
-    return drop_passing_tracks(labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES, sure_scores=sure_scores)
+    return drop_passing_tracks(
+        labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES, sure_looks=settings.sure_looks, sure_scores=sure_scores
+    )
 
 
 def without_doubles(labels: Iterable[Keypoints]) -> list[Keypoints]:

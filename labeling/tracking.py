@@ -99,30 +99,35 @@ def drop_passing_tracks(
     *,
     min_looks: int,
     min_frames: int,
+    sure_looks: int = 0,
     sure_scores: Mapping[Category, float] | None = None,
 ) -> list[Keypoints]:
-    """Without a network's mistakes: tracks of fewer than ``min_looks`` sure looks or ``min_frames`` frames.
+    """Without a network's mistakes: tracks of too few looks, of too few that were sure, or of too few frames.
 
     What flow carried or a neighbour lent does not count as a look; an object without keypoints counts by its box.
 
     Args:
         labels: tracked.
-        min_looks: how often it must have been seen, and be sure.
+        min_looks: how often it must have been seen.
         min_frames: from its first frame to its last.
+        sure_looks: how many of the looks must have been sure.
         sure_scores: by category, the score from which a look is sure; any score where nothing is said.
     """
     sure_scores = sure_scores or {}
     looks: dict[int, int] = {}
+    sure: dict[int, int] = {}
     frames: dict[int, list[int]] = {}
     for label in labels:
         seen = not label.present.any() or (label.point_source == POINT_DETECTED).any()
-        sure = label.score >= sure_scores.get(label.category, 0.0)
-        looks[label.track_id] = looks.get(label.track_id, 0) + bool(seen and sure)
+        believed = seen and label.score >= sure_scores.get(label.category, 0.0)
+        looks[label.track_id] = looks.get(label.track_id, 0) + bool(seen)
+        sure[label.track_id] = sure.get(label.track_id, 0) + bool(believed)
         frames.setdefault(label.track_id, []).append(label.frame)
     return [
         label
         for label in labels
         if looks[label.track_id] >= min_looks
+        and sure[label.track_id] >= sure_looks
         and max(frames[label.track_id]) - min(frames[label.track_id]) + 1 >= min_frames
     ]
 

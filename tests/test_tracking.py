@@ -154,7 +154,8 @@ def test_a_track_that_was_sure_only_once_is_dropped() -> None:
     frames = [[replace(car(t, 100), score=0.9 if t in sure else 0.4)] for sure in ((0,), (0, 5)) for t in range(10)]
     for part, kept in ((frames[:10], 0), (frames[10:], 10)):
         tracked = [label for labels in assign_tracks(part) for label in labels]
-        assert len(drop_passing_tracks(tracked, min_looks=2, min_frames=6, sure_scores={"car": 0.5})) == kept
+        sure = {"sure_looks": 2, "sure_scores": {"car": 0.5}}
+        assert len(drop_passing_tracks(tracked, min_looks=2, min_frames=6, **sure)) == kept
         assert drop_passing_tracks(tracked, min_looks=2, min_frames=6) == tracked
 
 
