@@ -45,10 +45,10 @@ EFFORTS: dict[Effort, EffortSettings] = {
     "balanced": EffortSettings(max_gap=8, max_person_gap=5, max_lane_gap=12, news_gap=4, flow_step=2, max_miss=0.04),
     "fast": EffortSettings(
         max_gap=12,
-        max_person_gap=12,
+        max_person_gap=10,
         max_lane_gap=12,
         news_gap=12,
-        flow_step=4,
+        flow_step=5,
         max_bend=0.05,
         max_miss=0.08,
         sure_looks=1,

@@ -78,7 +78,7 @@ def label_with(
     latest = None
     for number, frame in enumerate(frames, start=first_frame):
         if latest is None or number in breaks or not same_picture(latest, frame):
-            views, latest = _Views(frame), frame
+            views, latest = _Views(frame, number), frame
             for channel in channels:
                 channel.push(views, number=len(moments), fresh=number in breaks)
             moments.append(number)
@@ -141,8 +141,8 @@ def _on_grid(labels: Sequence[Keypoints], shown: Sequence[int], *, first_frame: 
 class _Views:
     """A frame and its small pictures, each made once, when somebody first needs it."""
 
-    def __init__(self, frame: np.ndarray) -> None:
-        self.frame = frame
+    def __init__(self, frame: np.ndarray, number: int) -> None:
+        self.frame, self.number = frame, number
 
     @cached_property
     def grey(self) -> np.ndarray:
@@ -198,7 +198,7 @@ class _Channel:
         if self._between.arriving(number):
             self._between.carry(views.grey, frame=number)
         self._turn(views, number)
-        seen = self.look.see(views.frame, number)
+        seen = [replace(label, frame=number) for label in self.look.see(views.frame, views.number)]
         carried = self._between.carried(number)
         seen = self._tracker.update(seen, frame=number, previous_to_current=self._turned, carried=carried)
         self._turned = np.eye(3)
