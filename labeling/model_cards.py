@@ -123,9 +123,9 @@ class YoloxCard(ModelCard, frozen=True):
         return tuple(self.score_thresholds.get(name, self.score_threshold) for name in self.class_names)
 
     @property
-    def category_sure_scores(self) -> dict[Category, float]:
+    def category_sure_scores(self) -> dict[str, float]:
         """The least score at which an object of each category may begin a track: that of its most trusted class."""
-        scores: dict[Category, float] = {}
+        scores: dict[str, float] = {}
         for name, category in self.categories.items():
             scores[category] = min(scores.get(category, 1.0), self.sure_scores.get(name, DEFAULT_SURE_SCORE))
         return scores

@@ -24,7 +24,7 @@ class Look(Protocol):
 
     carries: bool
     """Whether the points it gives lie on things that optical flow can follow."""
-    sure_scores: Mapping[Category, float]
+    sure_scores: Mapping[str, float]
     """Objects of each category that score at least this may begin a track."""
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
@@ -63,7 +63,7 @@ class ObjectLook:
     def __init__(self, extractors: Extractors, categories: Sequence[Category]) -> None:
         assert extractors.detector is not None
         self.extractors, self.categories = extractors, categories
-        self.sure_scores = extractors.detector.card.category_sure_scores
+        self.sure_scores: Mapping[str, float] = extractors.detector.card.category_sure_scores
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""
@@ -99,7 +99,7 @@ class FieldLook:
     def __init__(self, model: FieldModel, categories: Sequence[Category]) -> None:
         self.model, self.categories = model, categories
         self.carries = list(categories) != ["lane"]
-        self.sure_scores = dict.fromkeys(categories, _SURE_OBJECT_SCORE)
+        self.sure_scores: Mapping[str, float] = dict.fromkeys(categories, _SURE_OBJECT_SCORE)
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""

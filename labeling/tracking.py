@@ -8,7 +8,6 @@ import numpy as np
 from labeling.box_tracker import BoxTracker, TrackerSettings
 from labeling.labels import POINT_DETECTED, UNTRACKED, Keypoints
 from labeling.lane_tracker import LaneTracker
-from labeling.schemas import Category
 
 
 class RunTracker:
@@ -20,10 +19,10 @@ class RunTracker:
     """
 
     def __init__(
-        self, settings: TrackerSettings | None = None, *, sure_scores: Mapping[Category, float] | None = None
+        self, settings: TrackerSettings | None = None, *, sure_scores: Mapping[str, float] | None = None
     ) -> None:
         self._settings, self._sure_scores = settings or TrackerSettings(), dict(sure_scores or {})
-        self._trackers: dict[Category, BoxTracker | LaneTracker] = {}
+        self._trackers: dict[str, BoxTracker | LaneTracker] = {}
         self._next_id = 0
         self._frame: int | None = None
 
@@ -65,7 +64,7 @@ class RunTracker:
             out += [replace(label, track_id=int(i)) for label, i in zip(group, ids, strict=True) if i != UNTRACKED]
         return out
 
-    def _new_tracker(self, category: Category) -> "BoxTracker | LaneTracker":
+    def _new_tracker(self, category: str) -> "BoxTracker | LaneTracker":
         if category == "lane":
             return LaneTracker()
         sure = self._sure_scores.get(category, self._settings.high_score)
@@ -100,7 +99,7 @@ def drop_passing_tracks(
     min_looks: int,
     min_frames: int,
     sure_looks: int = 0,
-    sure_scores: Mapping[Category, float] | None = None,
+    sure_scores: Mapping[str, float] | None = None,
 ) -> list[Keypoints]:
     """Without a network's mistakes: tracks of too few looks, of too few that were sure, or of too few frames.
 

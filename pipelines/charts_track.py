@@ -53,7 +53,7 @@ class TrackClip:
 
     clip: KeypointClip
     looks: tuple[tuple[Keypoints, ...], ...]
-    sure_scores: Mapping[Category, float]
+    sure_scores: Mapping[str, float]
     """Of the detector that looked."""
 
     def look(self) -> Look:

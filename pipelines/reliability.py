@@ -91,7 +91,7 @@ def draw_reliability(curves: Sequence[ReliabilityCurve], path: Path, *, title: s
             offset = (number - (len(curves) - 1) / 2) * width
             below.bar([x + offset for x in middles], [one.points for one in filled], width, color=colour)
         above.set(ylim=(0, 1.02), xlim=(0, 1), ylabel="share within 0.1 of the box diagonal", title=title)
-        above.legend(frameon=False, loc="upper left")
+        above.legend(frameon=False, loc="lower right")
         above.grid(color="0.92")
         below.set(yscale="log", ylabel="points", xlabel="score")
         below.grid(axis="y", color="0.92")

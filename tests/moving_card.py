@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 
 from labeling.labels import POINT_DETECTED, Keypoints
-from labeling.schemas import Category
 
 WIDTH, HEIGHT = 320, 224
 
@@ -20,7 +19,7 @@ class MovingCard:
     """A textured card that slides and grows over a textured wall; it knows where its 24 points are in every frame."""
 
     carries = True
-    sure_scores: Mapping[Category, float] = {"car": 0.5}
+    sure_scores: Mapping[str, float] = {"car": 0.5}
 
     def __init__(
         self, *, speed: float = 2.0, growth: float = 0.0, cut: int | None = None, shown: range = range(999)

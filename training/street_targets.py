@@ -13,7 +13,7 @@ from training.street_networks import DETECTOR_STRIDES
 
 LEVEL_LIMITS_PX = (0.0, 40.0, 88.0, np.inf)
 """Root of the box area from which each stride of the detector is responsible, input pixels."""
-_CENTRE_RADIUS = 0.6
+CENTRE_RADIUS = 0.6
 """Strides from an object's middle to the cells that are responsible for it: nearly always one cell. With 1 or 1.5, up
 to nine, neighbours quarrel over whose object it is, and fewer people are found."""
 _FIELD_WINDOW = 4
@@ -59,9 +59,15 @@ def grid_cells(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def encode_boxes(
-    boxes_xyxy: np.ndarray, classes: np.ndarray, counted: np.ndarray, *, width: int, height: int
+    boxes_xyxy: np.ndarray,
+    classes: np.ndarray,
+    counted: np.ndarray,
+    *,
+    width: int,
+    height: int,
+    radius: float = CENTRE_RADIUS,
 ) -> GridTargets:
-    """Give each object the cell at its middle, on the stride that suits its size.
+    """Give each object the cells around its middle, on the stride that suits its size.
 
     Args:
         boxes_xyxy: (n, 4), inside the picture.
@@ -69,6 +75,7 @@ def encode_boxes(
         counted: (n,) bool; cells inside the box of an object that is not counted are left out of the loss.
         width: of the picture, a multiple of 32.
         height: of the picture.
+        radius: strides from the middle to the cells that are the object's.
     """
     shapes = [(height // stride, width // stride) for stride in DETECTOR_STRIDES]
     found = [np.full(shape, -1, np.int64) for shape in shapes]
@@ -81,7 +88,7 @@ def encode_boxes(
     for index in sorted(np.flatnonzero(counted), key=lambda i: -sizes[i]):
         box, level = boxes_xyxy[index], int(np.searchsorted(LEVEL_LIMITS_PX, sizes[index], side="right")) - 1
         stride = DETECTOR_STRIDES[level]
-        centre, radius = np.tile((box[:2] + box[2:]) / 2, 2), _CENTRE_RADIUS * stride
+        centre, radius = np.tile((box[:2] + box[2:]) / 2, 2), radius * stride
         mine = _cells_within(centre + np.array([-radius, -radius, radius, radius]), stride)
         found[level][mine], boxes[level][mine] = classes[index], box
     return GridTargets(

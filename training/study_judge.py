@@ -31,6 +31,8 @@ PAIR_FRAMES = 4
 """Native frames between the two that the camera's motion is read from."""
 _LEAST_HEIGHT, _LEAST_SHARE = 14.0, 0.3
 """Pixels of the labels' picture, and share: what the detector must find."""
+_RADIUS = 1.0
+"""Strides from a car's middle to its cells: the study's figures were measured so."""
 _BATCH, _PAIR_BATCH = 12, 16
 _REACH = (2, 4)
 _YAW_SCALE = 10.0
@@ -192,7 +194,9 @@ def detector_batch(
             picture = picture[:, ::-1]
             truth = np.stack([width - 1 - truth[:, 2], truth[:, 1], width - 1 - truth[:, 0], truth[:, 3]], axis=1)
         inside = np.clip(truth, 0, np.array([width, height, width, height], np.float32))
-        goal = encode_boxes(inside, np.zeros(len(truth), np.int64), clip.counted[index], width=width, height=height)
+        goal = encode_boxes(
+            inside, np.zeros(len(truth), np.int64), clip.counted[index], width=width, height=height, radius=_RADIUS
+        )
         pictures.append(np.clip(picture * rng.uniform(0.85, 1.15) + rng.uniform(-12, 12), 0, 255).astype(np.uint8))
         classes.append(goal.classes)
         boxes.append(goal.boxes_xyxy)
