@@ -96,7 +96,7 @@ def test_a_class_may_have_a_threshold_of_its_own() -> None:
     boxes = [(10, 10, 50, 50, 0, 0.35), (70, 10, 90, 60, 2, 0.2), (100, 10, 130, 60, 3, 0.35)]
     found = detect(boxes, score_thresholds={"car": 0.4, "person": 0.15})
     assert found.classes.tolist() == ["dog", "person"]
-    with pytest.raises(ValueError, match="score_thresholds name classes"):
+    with pytest.raises(ValueError, match="sure_scores name classes"):
         toy_card(score_thresholds={"horse": 0.4})
 
 

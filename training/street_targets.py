@@ -88,8 +88,8 @@ def encode_boxes(
     for index in sorted(np.flatnonzero(counted), key=lambda i: -sizes[i]):
         box, level = boxes_xyxy[index], int(np.searchsorted(LEVEL_LIMITS_PX, sizes[index], side="right")) - 1
         stride = DETECTOR_STRIDES[level]
-        centre, radius = np.tile((box[:2] + box[2:]) / 2, 2), radius * stride
-        mine = _cells_within(centre + np.array([-radius, -radius, radius, radius]), stride)
+        centre, reach = np.tile((box[:2] + box[2:]) / 2, 2), radius * stride
+        mine = _cells_within(centre + np.array([-reach, -reach, reach, reach]), stride)
         found[level][mine], boxes[level][mine] = classes[index], box
     return GridTargets(
         classes=np.concatenate([level.ravel() for level in found]),
