@@ -91,6 +91,15 @@ def test_people_who_pass_behind_a_column_come_out_as_themselves() -> None:
     assert switched <= 0.15 * passages, f"{switched} of {passages}"
 
 
+def test_who_comes_out_is_the_one_who_went_that_way() -> None:
+    """Two hidden people: one is expected 20 px from where somebody comes out, but walks away from there."""
+    away: list[np.ndarray | None] = [box(500 - 5 * t) if t < 30 else None for t in range(41)]
+    towards: list[np.ndarray | None] = [box(90 + 5 * t) if t < 30 or t == 40 else None for t in range(41)]
+    towards[40] = box(320)
+    ids = follow([away, towards])
+    assert ids[40, 1] == ids[0, 1] != ids[0, 0]
+
+
 def test_small_fast_objects_are_kept() -> None:
     ids = follow([[box(100 + 11 * t, width=12, height=10) for t in range(40)]])
     assert len(set(ids[2:, 0])) == 1

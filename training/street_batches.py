@@ -27,6 +27,7 @@ _HIDDEN_WEIGHT = 0.25
 _MEAN_COLOUR = tuple(float(round(value)) for value in IMAGENET_MEAN)
 _BOX_SLACK_PX = 2.0
 _USUAL_CROP_PX = 40.0
+"""Height of an object that is drawn as often as there are such: higher ones more often, lower ones less."""
 _FOUND_WITHIN = 0.1
 """Of the box diagonal: what PCK@0.1 calls right."""
 
