@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from labeling.boxes import iou
 from labeling.labels import UNTRACKED
 
 _UNMATCHED = 1.0
@@ -172,15 +173,6 @@ class BoxTracker:
         )  # fmt: skip
         self.next_id += 1
         return self.next_id - 1
-
-
-def iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
-    """(N, M) intersection over union of (N, 4) and (M, 4) boxes, left top right bottom."""
-    corner = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
-    sides = np.clip(np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:]) - corner, 0, None)
-    shared = sides.prod(axis=2)
-    area_a, area_b = ((boxes[:, 2:] - boxes[:, :2]).clip(0).prod(axis=1) for boxes in (boxes_a, boxes_b))
-    return shared / np.maximum(area_a[:, None] + area_b[None] - shared, 1e-9)
 
 
 def _turned_back(track: _Track, boxes_xyxy: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from labeling.boxes import iou
 from labeling.model_cards import YoloxCard
 from labeling.onnx_model import DEFAULT_PROVIDERS, OnnxModel, check_frame, network_input
 from labeling.schemas import Category
@@ -19,8 +20,8 @@ LETTERBOX_GREY = 114
 STRIDES = (8, 16, 32)
 _MAX_CANDIDATES = 2000
 """Pairs of box and class that enter the suppression, best first: it bounds the time of the worst frame."""
-DOUBLE_IOU = 0.45
-"""Two boxes of one category that overlap by more are one object (YOLOX's own threshold)."""
+_DOUBLE_IOU = 0.45
+"""Two boxes of one category, but different classes, that overlap by more are one object (YOLOX's own threshold)."""
 _MIN_SIDE_PX = 1e-3
 
 
@@ -49,14 +50,18 @@ class Detections:
             categories=self.categories[keep], left_out=self.left_out,
         )  # fmt: skip
 
-    def distinct(self, iou_threshold: float = DOUBLE_IOU) -> "Detections":
-        """Without those that a better one of the same category overlaps: a van seen as car and as truck is one object.
+    def distinct(self, iou_threshold: float = _DOUBLE_IOU) -> "Detections":
+        """Without those that a better one of the same category, but of another class, overlaps: a van seen as car and
+        as truck is one object.
 
-        Classes without a category are left as they are.
+        Boxes of one class are left to the detector's own suppression, and classes without a category as they are.
         """
-        groups = np.where(self.categories == "", self.classes, self.categories)
-        _, labels = np.unique(groups, return_inverse=True)
-        return self.select(suppress_overlaps(self.boxes_xyxy, labels, iou_threshold))
+        keep: list[int] = []
+        for index, (category, name) in enumerate(zip(self.categories, self.classes, strict=True)):
+            rivals = [i for i in keep if category and self.categories[i] == category and self.classes[i] != name]
+            if not len(rivals) or iou(self.boxes_xyxy[[index]], self.boxes_xyxy[rivals]).max() <= iou_threshold:
+                keep.append(index)
+        return self.select(np.array(keep, dtype=np.intp))
 
     def of_category(self, category: Category) -> "Detections":
         """The distinct objects of one category."""
@@ -127,6 +132,8 @@ def letterbox(frame: np.ndarray, card: YoloxCard) -> tuple[np.ndarray, float]:
 def decode_yolox(output: np.ndarray, card: YoloxCard, *, ratio: float, width: int, height: int) -> Detections:
     """Boxes of one frame from raw grid outputs (Ge et al. 2021, YOLOX): ``xy = (p + grid) s``, ``wh = exp(p) s``.
 
+    Doubles are cleared as the card says; with ``soft_nms`` scores are those that are left of the network's.
+
     Args:
         output: (sum(hw/s^2), 5 + C) float32; objectness and class scores are sigmoid already.
         card: classes and thresholds.
@@ -134,14 +141,17 @@ def decode_yolox(output: np.ndarray, card: YoloxCard, *, ratio: float, width: in
         width: of the frame; boxes are cut there, and those of no area left out.
         height: of the frame.
     """
-    scores = output[:, 4:5] * output[:, 5:]
-    rows, class_ids = np.nonzero(scores > np.array(card.class_thresholds, np.float32))
+    scores, least = output[:, 4:5] * output[:, 5:], np.array(card.class_thresholds, np.float32)
+    rows, class_ids = np.nonzero(scores > least)
     values = scores[rows, class_ids]
     order = np.argsort(-values, kind="stable")[:_MAX_CANDIDATES]
     rows, class_ids, values = rows[order], class_ids[order], values[order]
     boxes = _decode_boxes(output[rows, :4], rows, card) / np.float32(ratio)
     # Doubles are cleared before boxes are cut: two objects that leave the picture must not become one.
-    keep = suppress_overlaps(boxes, class_ids, card.nms_threshold)
+    if card.soft_nms:
+        keep, values = soften_overlaps(boxes, values, class_ids, card.nms_threshold, least[class_ids])
+    else:
+        keep = suppress_overlaps(boxes, class_ids, card.nms_threshold)
     boxes = np.clip(boxes, 0, np.array([width, height, width, height], np.float32))
     sides = boxes[keep, 2:] - boxes[keep, :2]
     keep = keep[(sides > _MIN_SIDE_PX).all(axis=1)]
@@ -165,7 +175,6 @@ def suppress_overlaps(boxes_xyxy: np.ndarray, labels: np.ndarray, iou_threshold:
     Returns:
         Indices of the boxes that stay, best first.
     """
-    areas = np.prod(np.maximum(boxes_xyxy[:, 2:] - boxes_xyxy[:, :2], 0), axis=1)
     alive = np.ones(len(boxes_xyxy), bool)
     kept = []
     for i in range(len(boxes_xyxy)):
@@ -173,11 +182,39 @@ def suppress_overlaps(boxes_xyxy: np.ndarray, labels: np.ndarray, iou_threshold:
             continue
         kept.append(i)
         rivals = i + 1 + np.flatnonzero(alive[i + 1 :] & (labels[i + 1 :] == labels[i]))
-        corners = np.maximum(boxes_xyxy[rivals, :2], boxes_xyxy[i, :2])
-        sides = np.maximum(np.minimum(boxes_xyxy[rivals, 2:], boxes_xyxy[i, 2:]) - corners, 0)
-        shared = sides[:, 0] * sides[:, 1]
-        alive[rivals[shared > iou_threshold * (areas[rivals] + areas[i] - shared)]] = False
+        alive[rivals[iou(boxes_xyxy[[i]], boxes_xyxy[rivals])[0] > iou_threshold]] = False
     return np.array(kept, dtype=np.intp)
+
+
+def soften_overlaps(
+    boxes_xyxy: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou_threshold: float, least: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Soft non-maximum suppression within each label, linear (Bodla et al. 2017, equation 2).
+
+    A box that overlaps a better one keeps ``1 - IoU`` of its score, and goes where too little is left: of two that
+    overlap by half, a confident second one is an object that stands before or behind the first, a timid one its double.
+
+    Args:
+        boxes_xyxy: (N, 4).
+        scores: (N,) descending.
+        labels: (N,) integers; boxes of different labels leave each other alone.
+        iou_threshold: overlap from which a score falls.
+        least: (N,) what must be left of each.
+
+    Returns:
+        Indices of the boxes that stay, best first by what is left, and (N,) what is left of all scores.
+    """
+    left, alive = scores.copy(), np.ones(len(scores), bool)
+    kept = []
+    while alive.any():
+        i = int(np.where(alive, left, -1).argmax())
+        kept.append(i)
+        alive[i] = False
+        rivals = np.flatnonzero(alive & (labels == labels[i]))
+        overlap = iou(boxes_xyxy[[i]], boxes_xyxy[rivals])[0]
+        left[rivals] *= np.where(overlap > iou_threshold, 1 - overlap, 1)
+        alive[rivals] = left[rivals] > least[rivals]
+    return np.array(kept, dtype=np.intp), left
 
 
 def _decode_boxes(raw: np.ndarray, rows: np.ndarray, card: YoloxCard) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 
 from labeling.between_looks import BetweenLooks
 from labeling.carrying import small_grey
-from labeling.detection import DOUBLE_IOU, suppress_overlaps
+from labeling.detection import suppress_overlaps
 from labeling.efforts import EFFORTS, Effort, EffortSettings, Rhythm
 from labeling.extractors import Extractors
 from labeling.labels import Keypoints
@@ -26,6 +26,8 @@ from labeling.picture_turn import picture_turn, turn_view
 from labeling.smoothing import smooth_tracks
 from labeling.tracking import RunTracker, drop_passing_tracks
 
+_COVERED_IOU = 0.6
+"""Overlap of two labels of one category of which the lesser is not in view; visible parts overlap by up to 0.55."""
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
 """What lasts less than a quarter of a second, or was seen once, is taken for a mistake."""
@@ -97,7 +99,7 @@ def label_with(
 def without_doubles(labels: Iterable[Keypoints]) -> list[Keypoints]:
     """Labels of which none is covered by a better one of its category in the same frame.
 
-    A detector's boxes never cover each other so; what is carried or smoothed on while something steps before it does.
+    Objects in view never cover each other so; what is carried or smoothed on while something steps before it does.
     """
     groups: dict[tuple[int, str], list[Keypoints]] = {}
     for label in labels:
@@ -109,7 +111,7 @@ def without_doubles(labels: Iterable[Keypoints]) -> list[Keypoints]:
             continue
         ordered = sorted(group, key=lambda label: -label.score)
         boxes = np.stack([label.box_xyxy for label in ordered])
-        kept += [ordered[i] for i in suppress_overlaps(boxes, np.zeros(len(boxes)), DOUBLE_IOU)]
+        kept += [ordered[i] for i in suppress_overlaps(boxes, np.zeros(len(boxes)), _COVERED_IOU)]
     return sorted(kept, key=lambda label: (label.frame, label.track_id))
 
 

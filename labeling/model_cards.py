@@ -97,6 +97,9 @@ class YoloxCard(ModelCard, frozen=True):
     sure_scores: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=dict)
     """Class name to the least score at which an object may begin a track; 0.5 where nothing is said."""
     nms_threshold: float = Field(default=0.45, gt=0, le=1)
+    """Overlap with a better box of its class above which a box goes or, with ``soft_nms``, its score falls."""
+    soft_nms: bool = False
+    """Suppress by lowering scores (Bodla et al. 2017): for detectors that are sure of what stands close together."""
     max_detections: int = Field(default=200, gt=0)
     """The best of a frame; how many more there were is said in ``Detections.left_out``."""
 

@@ -12,7 +12,8 @@ from functools import partial
 import numpy as np
 
 from dataset.street import Scenario
-from labeling.box_tracker import TrackerSettings, iou
+from labeling.box_tracker import TrackerSettings
+from labeling.boxes import iou
 from labeling.efforts import EFFORTS, EffortSettings
 from labeling.extraction import label_with
 from labeling.labels import Keypoints

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from labeling.box_tracker import iou
+from labeling.boxes import iou
 from labeling.camera import Intrinsics
 from labeling.detection import Detector
 from labeling.ego_motion import estimate_ego_motion

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from dataset.street_labels import StreetObject
-from labeling.box_tracker import iou
+from labeling.boxes import iou
 from labeling.labels import Keypoints
 from labeling.schemas import Category
 from pipelines.keypoint_errors import BODIES, MatchedFrame, by_frame

@@ -8,7 +8,8 @@ import numpy as np
 import onnx_fixtures
 import pytest
 
-from labeling.detection import Detections, Detector, decode_yolox, letterbox, suppress_overlaps
+from labeling.boxes import iou
+from labeling.detection import Detections, Detector, decode_yolox, letterbox, soften_overlaps, suppress_overlaps
 from labeling.errors import ModelError
 from labeling.model_cards import YoloxCard, load_cards
 
@@ -148,6 +149,47 @@ def test_suppression_equals_the_plain_double_loop() -> None:
         if not any(labels[i] == labels[k] and overlap(boxes[i], boxes[k]) > 0.3 for k in plain):
             plain.append(i)
     assert suppress_overlaps(boxes, labels, 0.3).tolist() == plain
+
+
+def test_soft_suppression_keeps_a_confident_neighbour_and_drops_a_double() -> None:
+    boxes = np.array([[0, 0, 60, 60], [20, 0, 80, 60], [2, 1, 62, 61], [300, 0, 360, 60], [20, 0, 80, 60]], np.float32)
+    scores, labels = np.array([0.9, 0.8, 0.7, 0.6, 0.5], np.float32), np.array([0, 0, 0, 0, 1])
+    keep, left = soften_overlaps(boxes, scores, labels, 0.3, np.full(5, 0.25))
+    assert keep.tolist() == [0, 3, 4, 1]
+    # A half is shared with the first: 40 of 60 px, so 40 / 80.
+    np.testing.assert_allclose(left[keep], [0.9, 0.6, 0.5, 0.8 * 0.5])
+    assert suppress_overlaps(boxes, labels, 0.45).tolist() == [0, 3, 4]
+    assert soften_overlaps(boxes, scores, labels, 0.6, np.full(5, 0.25))[0].tolist() == [0, 1, 3, 4]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_soft_suppression_equals_the_plain_loop(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(0, 60, (60, 2))
+    boxes = np.concatenate([corners, corners + rng.uniform(5, 60, (60, 2))], axis=1)
+    scores, labels = np.sort(rng.uniform(0.2, 1, 60))[::-1].copy(), rng.integers(0, 2, 60)
+    plain: list[tuple[int, float]] = []
+    left, rest = scores.tolist(), list(range(60))
+    while rest:
+        best = max(rest, key=lambda i: left[i])
+        rest.remove(best)
+        plain.append((best, left[best]))
+        for other in rest:
+            overlap = float(iou(boxes[[best]], boxes[[other]])[0, 0])
+            if labels[other] == labels[best] and overlap > 0.3:
+                left[other] *= 1 - overlap
+    wanted = [(index, score) for index, score in plain if score > 0.2]
+    keep, values = soften_overlaps(boxes, scores, labels, 0.3, np.full(60, 0.2))
+    assert 3 < len(keep) < 60 and keep.tolist() == [index for index, _ in wanted]
+    np.testing.assert_allclose(values[keep], [score for _, score in wanted])
+
+
+def test_a_card_may_ask_for_soft_suppression() -> None:
+    output = raw_output([(0, 0, 60, 60, 0, 0.9), (20, 0, 80, 60, 0, 0.8), (2, 1, 62, 61, 0, 0.7)])
+    card = toy_card(nms_threshold=0.3, soft_nms=True, score_threshold=0.25)
+    found = decode_yolox(output, card, ratio=1, width=WIDTH, height=HEIGHT)
+    np.testing.assert_allclose(found.scores, [0.9, 0.4], rtol=1e-6)
+    assert len(found.of_category("car")) == 2
 
 
 @pytest.mark.parametrize("size", [(96, 160), (540, 960), (960, 540), (1, 1), (3, 4000)], ids=str)

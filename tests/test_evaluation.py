@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from labeling.boxes import iou
 from labeling.camera import cover_map, rigid
 from labeling.errors import DataError
 from labeling.labels import Keypoints
@@ -34,7 +35,7 @@ from training.evaluation_report import (
     outcome,
     result_from_json,
 )
-from training.label_agreement import box_agreement, box_overlaps, mapped_labels, point_agreement
+from training.label_agreement import box_agreement, mapped_labels, point_agreement
 from training.metrics import paired_interval
 
 WIDTH, HEIGHT, COUNT = 200, 100, 25
@@ -121,7 +122,7 @@ def test_evo_agrees_on_a_bend_at_another_rate(alignment: str) -> None:
 
 def test_box_iou_by_hand() -> None:
     boxes = np.array([[0, 0, 10, 10], [5, 0, 15, 10], [20, 20, 30, 30]], np.float32)
-    assert box_overlaps(boxes[:1], boxes) == pytest.approx(np.array([[1, 1 / 3, 0]]))
+    assert iou(boxes[:1], boxes) == pytest.approx(np.array([[1, 1 / 3, 0]]))
     wanted = [car(0), car(0, left=120, track_id=2), car(1)]
     # One exact, one shifted by a quarter (30 / 50 = 0.6), one missed, one phantom.
     found = [car(0), car(0, left=130), car(2)]

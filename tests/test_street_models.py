@@ -1,5 +1,6 @@
 """Street models: targets decode to the truth through the labelling code, training steps learn, what ships holds."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,9 +18,9 @@ from labeling.model_cards import SHIPPED_CARDS, FieldHeadCard, SimccCard, YoloxC
 from labeling.onnx_model import OnnxModel
 from labeling.schemas import keypoint_schema
 from training.street_augment import AugmentSettings, disturb, map_points, random_map
-from training.street_batches import Batch, CropBatches, FieldBatches, behind_board, mirror_order
+from training.street_batches import Batch, CropBatches, FieldBatches, behind_board, mirror_order, to_input
 from training.street_export import export_model, fold_norms
-from training.street_fitting import FitSettings, fit, rate_at
+from training.street_fitting import FitSettings, best_precision, fit, rate_at
 from training.street_losses import detector_loss, field_loss, simcc_loss
 from training.street_models import evaluate
 from training.street_networks import FieldGraph, FieldNetwork, Sharpening, SimccGraph, SimccNetwork, StreetDetector
@@ -87,6 +88,37 @@ def test_objects_that_do_not_count_are_neither_asked_for_nor_forbidden() -> None
     targets = encode_boxes(boxes, np.array([0]), np.array([False]), width=WIDTH, height=HEIGHT)
     assert set(targets.classes) == {-1, -2}
     assert not targets.boxes_xyxy.any()
+    np.testing.assert_array_equal(targets.weights, targets.classes == -1)
+    person = encode_boxes(boxes, np.array([1]), np.array([False]), width=WIDTH, height=HEIGHT)
+    assert set(person.classes) == {-1, -3}
+    # It costs nothing to find or to miss it, but to call it a car does.
+    cells, strides = (torch.from_numpy(array) for array in grid_cells(WIDTH, HEIGHT))
+    classes, there, weights = (
+        torch.from_numpy(part)[None] for part in (person.classes, person.boxes_xyxy, person.weights)
+    )
+
+    def loss(objectness: float, name: float) -> float:
+        rows = torch.full((1, len(cells), 7), -9.0)
+        on_it = classes[0] == -3
+        rows[0, on_it, 4], rows[0, on_it, 5], rows[0, on_it, 6] = objectness, name, -name
+        return float(detector_loss(rows, classes, there, weights, cells, strides))
+
+    assert loss(-9.0, -9.0) == pytest.approx(loss(9.0, -9.0)) and loss(9.0, 9.0) > loss(9.0, -9.0) + 1
+
+
+def test_cells_that_are_nearly_responsible_weigh_less() -> None:
+    """A middle on the border of two cells is a toss; one in the middle of a cell is not."""
+    for middle, shy in ((39.99, 0.1), (36.0, 0.6)):
+        box = np.array([[middle - 12, 24, middle + 12, 48]], np.float32)
+        targets = encode_boxes(box, np.array([0]), np.array([True]), width=WIDTH, height=HEIGHT)
+        weights = targets.weights[: WIDTH // 8 * HEIGHT // 8].reshape(HEIGHT // 8, WIDTH // 8)
+        assert (targets.classes >= 0).sum() == 1 and weights[4, 4] == 1
+        assert weights[4, 5] < shy and weights[4, 3] > 0.5
+        assert (weights[:, 10:] == 1).all() and (targets.weights[weights.size :] == 1).all()
+    # 42 px are next to the limit of 40: the finer stride might have found it as well.
+    box = np.array([[20, 20, 62, 62]], np.float32)
+    targets = encode_boxes(box, np.array([0]), np.array([True]), width=WIDTH, height=HEIGHT)
+    assert targets.weights[: WIDTH // 8 * HEIGHT // 8].min() < 0.2
 
 
 def test_points_come_back_through_the_simcc_decoding() -> None:
@@ -159,7 +191,7 @@ def test_disturbed_pictures_repeat_with_the_seed() -> None:
 
 
 def field_batch_loss(network: torch.nn.Module, batch: Batch) -> torch.Tensor:
-    cif, caf = network(batch.pictures)[0]
+    cif, caf = network(to_input(batch.pictures, "imagenet"))[0]
     return field_loss(cif, *batch.targets[:2]) + field_loss(caf, *batch.targets[2:])
 
 
@@ -208,6 +240,44 @@ def test_a_training_that_stopped_goes_on_to_the_same_weights(toy_pool: StreetPoo
         assert torch.equal(one, other)
 
 
+def test_batches_from_processes_train_the_same_network(toy_pool: StreetPool) -> None:
+    batches = FieldBatches(pool=toy_pool, schemas=("lane24",), size=(129, 97), count=1, augment=AugmentSettings())
+    networks = []
+    for loaders in (0, 2):
+        torch.manual_seed(3)
+        network = FieldNetwork(("lane24",), widths=(8, 8, 8, 8, 8), width=8)
+        settings = FitSettings(seed=3, steps=5, loaders=loaders, precision=torch.float32)
+        networks.append(fit(network, batches, field_batch_loss, settings))
+    for one, other in zip(networks[0].state_dict().values(), networks[1].state_dict().values(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_a_finished_training_is_read_and_not_repeated(tmp_path: Path) -> None:
+    def make_batch(rng: np.random.Generator) -> torch.Tensor:
+        return torch.from_numpy(rng.standard_normal((2, 3)).astype(np.float32))
+
+    def loss(network: torch.nn.Module, batch: torch.Tensor) -> torch.Tensor:
+        return network(batch).square().mean()
+
+    def never(rng: np.random.Generator) -> torch.Tensor:
+        raise AssertionError("trained again")
+
+    settings = FitSettings(seed=1, steps=4, channels_last=False, precision=torch.float32)
+    trained = fit(torch.nn.Linear(3, 1), make_batch, loss, settings, checkpoint=tmp_path / "state.pt")
+    read = fit(torch.nn.Linear(3, 1), never, loss, settings, checkpoint=tmp_path / "state.pt")
+    for one, other in zip(trained.state_dict().values(), read.state_dict().values(), strict=True):
+        assert torch.equal(one, other)
+    assert not read.training and not (tmp_path / "state.part").exists()
+    with pytest.raises(ModelError, match="finished after 4 steps"):
+        fit(torch.nn.Linear(3, 1), never, loss, replace(settings, steps=8), checkpoint=tmp_path / "state.pt")
+
+
+def test_processors_without_bfloat16_use_float32() -> None:
+    assert best_precision(torch.device("cuda")) == torch.bfloat16
+    native = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    assert (best_precision(torch.device("cpu")) == torch.bfloat16) == native
+
+
 def test_points_in_doubt_score_lower_when_hidden_ones_weigh_more() -> None:
     flat = torch.zeros(1, 2, 8)
     for weight in (1.0, 3.0):
@@ -232,7 +302,8 @@ def test_the_detector_loss_is_least_for_the_truth() -> None:
     rows[0, mine, 4], rows[0, mine, 6] = 8.0, 8.0
 
     def loss(values: torch.Tensor) -> float:
-        return float(detector_loss(values, torch.from_numpy(targets.classes)[None], truth[None], cells, strides))
+        classes, weights = torch.from_numpy(targets.classes)[None], torch.from_numpy(targets.weights)[None]
+        return float(detector_loss(values, classes, truth[None], weights, cells, strides))
 
     best = loss(rows)
     assert best < 0.1

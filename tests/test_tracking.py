@@ -7,7 +7,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from labeling.box_tracker import BoxTracker, iou
+from labeling.box_tracker import BoxTracker
+from labeling.boxes import iou
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.lane_tracker import LaneTracker, line_distance
 from labeling.tracking import RunTracker, assign_tracks, drop_passing_tracks

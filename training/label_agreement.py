@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from labeling.boxes import iou
 from labeling.camera import PictureMap
 from labeling.errors import DataError
 from labeling.labels import Keypoints
@@ -146,8 +147,9 @@ def match_objects(found: Sequence[Keypoints], wanted: Sequence[Keypoints]) -> li
     for ours, theirs in groups.values():
         if not ours or not theirs:
             continue
-        overlaps = box_overlaps(
-            np.stack([found[i].box_xyxy for i in ours]), np.stack([wanted[j].box_xyxy for j in theirs])
+        overlaps = iou(
+            np.stack([found[i].box_xyxy for i in ours]).astype(np.float64),
+            np.stack([wanted[j].box_xyxy for j in theirs]).astype(np.float64),
         )
         # A pair too far apart is worth nothing, so that it never keeps a true pair from being made.
         worth = np.where(overlaps >= MATCH_IOU, overlaps, 0.0)
@@ -155,15 +157,6 @@ def match_objects(found: Sequence[Keypoints], wanted: Sequence[Keypoints]) -> li
             if worth[row, column] > 0:
                 pairs.append((ours[row], theirs[column], float(worth[row, column])))
     return pairs
-
-
-def box_overlaps(first_xyxy: np.ndarray, second_xyxy: np.ndarray) -> np.ndarray:
-    """(n, m) intersection over union of (n, 4) and (m, 4) boxes."""
-    first, second = first_xyxy[:, None].astype(np.float64), second_xyxy[None].astype(np.float64)
-    sides = np.minimum(first[..., 2:], second[..., 2:]) - np.maximum(first[..., :2], second[..., :2])
-    shared = np.prod(np.maximum(sides, 0.0), axis=-1)
-    areas = [np.prod(boxes[..., 2:] - boxes[..., :2], axis=-1) for boxes in (first, second)]
-    return shared / np.maximum(areas[0] + areas[1] - shared, 1e-9)
 
 
 def mapped_labels(labels: Sequence[Keypoints], picture: PictureMap) -> list[Keypoints]:

@@ -183,4 +183,4 @@ def _grain(picture: np.ndarray, rng: np.random.Generator, largest_sigma: float) 
     top, left = rng.integers(0, (_NOISE_SIDE - height, _NOISE_SIDE - width))
     noise = _grain_bank[0][top : top + height, left : left + width]
     sigma = rng.uniform(1, largest_sigma)
-    return cv2.add(picture, noise * (sigma / 16), dtype=cv2.CV_8U)
+    return cv2.addWeighted(picture, 1.0, noise, sigma / 16, 0.0, dtype=cv2.CV_8U)

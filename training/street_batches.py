@@ -1,7 +1,7 @@
 """Batches for each street model: pool pictures, moved and disturbed, with the targets that belong to them."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,7 +15,7 @@ from labeling.schemas import Category, KeypointSchema, keypoint_schema
 from training.street_augment import AugmentSettings, disturb, map_boxes, map_points, put_board, random_map
 from training.street_networks import FIELD_STRIDE
 from training.street_pool import ObjectTruth, PoolCrop, PoolFrame, StreetPool, frames_with
-from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses
+from training.street_targets import FieldVotes, GridTargets, encode_boxes, encode_fields, encode_responses
 
 CLASSES: tuple[Category, ...] = ("car", "person")
 CROP_PADDING = 1.25
@@ -34,19 +34,32 @@ _FOUND_WITHIN = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Batch:
-    """Network input and whatever the loss needs beside it."""
+    """Pictures and whatever the loss needs beside them."""
 
     pictures: torch.Tensor
-    """(N, 3, H, W) float32, normalised as the card says, channels last in memory."""
+    """(N, H, W, 3) uint8 RGB: a quarter of what ``to_input`` makes of it, for the way to a device."""
     targets: tuple[torch.Tensor, ...]
 
+    def to(self, device: torch.device) -> "Batch":
+        """The same, there."""
+        return self._each(lambda tensor: tensor.to(device, non_blocking=True))
 
-def to_input(pictures: list[np.ndarray], normalisation: Literal["imagenet", "bgr255"]) -> torch.Tensor:
-    """(h, w, 3) uint8 RGB pictures as one normalised batch."""
-    batch = torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2)
+    def pin_memory(self) -> "Batch":
+        """The same, in memory that a GPU fetches by itself; ``DataLoader`` asks for it."""
+        return self._each(torch.Tensor.pin_memory)
+
+    def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "Batch":
+        return Batch(pictures=change(self.pictures), targets=tuple(change(target) for target in self.targets))
+
+
+def to_input(pictures: torch.Tensor, normalisation: Literal["imagenet", "bgr255"]) -> torch.Tensor:
+    """(N, 3, H, W) float32 normalised network input, channels last in memory, from (N, H, W, 3) uint8 RGB."""
+    batch = pictures.permute(0, 3, 1, 2)
     if normalisation == "bgr255":
         return batch.flip(1).float().contiguous(memory_format=torch.channels_last)
-    mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
+    mean, std = (
+        batch.new_tensor(values, dtype=torch.float32).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD)
+    )
     return ((batch.float() - mean) / std).contiguous(memory_format=torch.channels_last)
 
 
@@ -73,8 +86,9 @@ class DetectorBatches:
     """Of windows around a person: they are small and rare."""
 
     def __call__(self, rng: np.random.Generator) -> Batch:
-        """One batch: targets are classes (N, A) and boxes (N, A, 4)."""
-        pictures, classes, boxes = [], [], []
+        """One batch: targets are classes (N, A), boxes (N, A, 4) and weights (N, A)."""
+        pictures: list[np.ndarray] = []
+        targets: list[GridTargets] = []
         with_people = frames_with(self.pool, "person")
         *size, count = self.sizes[int(rng.integers(len(self.sizes)))]
         for _ in range(count):
@@ -90,12 +104,10 @@ class DetectorBatches:
             window = cv2.warpAffine(frame.picture, picture_to_window, size, borderValue=grey)
             found = [truth for truth in frame.objects if truth.category in CLASSES]
             inside, labels, counted = _boxes_inside(found, frame.scale, picture_to_window, size)
-            targets = encode_boxes(inside, labels, counted, width=size[0], height=size[1])
+            targets.append(encode_boxes(inside, labels, counted, width=size[0], height=size[1]))
             pictures.append(disturb(window, rng, self.augment))
-            classes.append(targets.classes)
-            boxes.append(targets.boxes_xyxy)
-        targets = (torch.from_numpy(np.stack(classes)), torch.from_numpy(np.stack(boxes)))
-        return Batch(pictures=to_input(pictures, "bgr255"), targets=targets)
+        parts = zip(*((one.classes, one.boxes_xyxy, one.weights) for one in targets), strict=True)
+        return Batch(pictures=_stack(pictures), targets=tuple(_stack(part) for part in parts))
 
     def _focus(self, frame: PoolFrame, rng: np.random.Generator, category: Category) -> np.ndarray | None:
         """The middle of one object, picture pixels; one window in four lies anywhere."""
@@ -154,7 +166,7 @@ class CropBatches:
             visible.append(crop.truth.visible[chosen])
             sides = crop.truth.box_xyxy[2:] - crop.truth.box_xyxy[:2]
             tolerances.append(_FOUND_WITHIN * 2 * scale * float(np.hypot(*sides)))
-        return Batch(pictures=to_input(pictures, "imagenet"), targets=self._targets(points, visible, tolerances))
+        return Batch(pictures=_stack(pictures), targets=self._targets(points, visible, tolerances))
 
     def _map(self, crop: PoolCrop, rng: np.random.Generator, flip: bool) -> tuple[np.ndarray, float]:
         box = crop.truth.box_xyxy
@@ -229,7 +241,7 @@ class FieldBatches:
             pictures.append(disturb(moved, rng, self.augment))
             targets.append(self._fields(frame, picture_to_input, flip))
         stacked = [tensor for votes in zip(*targets, strict=True) for tensor in _stack_votes(votes)]
-        return Batch(pictures=to_input(pictures, "imagenet"), targets=tuple(stacked))
+        return Batch(pictures=_stack(pictures), targets=tuple(stacked))
 
     def _fields(self, frame: PoolFrame, picture_to_input: np.ndarray, flip: bool) -> list[FieldVotes]:
         fields: list[FieldVotes] = []
@@ -244,6 +256,10 @@ class FieldBatches:
             encoded = encode_fields(placed, table, columns=columns, rows=rows, stride=FIELD_STRIDE)
             fields += [encoded.cif, encoded.caf]
         return fields
+
+
+def _stack(pictures: Sequence[np.ndarray]) -> torch.Tensor:
+    return torch.from_numpy(np.stack(pictures))
 
 
 def _stack_votes(votes: Sequence[FieldVotes]) -> tuple[torch.Tensor, torch.Tensor]:

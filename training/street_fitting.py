@@ -1,4 +1,5 @@
-"""One training loop for all street models: seeded, prefetched, resumable; the same seed gives the same weights."""
+"""One training loop for all street models: seeded, prefetched, resumable; on processors the same seed gives the same
+weights."""
 
 import copy
 import math
@@ -11,14 +12,19 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.utils.data import DataLoader, Dataset
+
+from labeling.errors import ModelError
 
 LossFunction = Callable[[nn.Module, Any], torch.Tensor]
 BatchMaker = Callable[[np.random.Generator], Any]
+_AHEAD = 3
+"""Batches that wait for the network, for each process that makes them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitSettings:
-    """How long and how fast one network learns."""
+    """How long and how fast one network learns, and on what."""
 
     seed: int
     steps: int
@@ -27,10 +33,15 @@ class FitSettings:
     weight_decay: float = 0.01
     average_decay: float = 0.998
     """Of the moving average of weights that is returned."""
-    precision: torch.dtype = torch.bfloat16
-    """Of convolutions and products; weights and losses stay float32."""
+    precision: torch.dtype | None = None
+    """Of convolutions and products; weights and losses stay float32. None: bfloat16 where the device multiplies it
+    faster (``best_precision``)."""
     channels_last: bool = True
     """Lay pictures out pixel by pixel, which 2-D convolutions are faster on; networks over videos cannot."""
+    device: str = "cpu"
+    """Anywhere else batches must have ``to(device)``."""
+    loaders: int = 0
+    """Processes that make batches, for a device that outruns one core; 0: a thread."""
     report_every: int = 500
     name: str = "network"
 
@@ -43,18 +54,23 @@ def fit(
     *,
     checkpoint: Path | None = None,
 ) -> nn.Module:
-    """Train ``network`` in place; the moving average of its weights is returned, ready for inference.
+    """Train ``network`` in place; the moving average of its weights is returned, on the CPU, ready for inference.
 
     Args:
         network: initialised by the caller, under ``torch.manual_seed``.
         make_batch: gives one batch for a generator that is seeded by ``(seed, step)``, so that batches do not depend on
-            threads.
+            threads or processes.
         loss_of: scalar loss of a network and a batch.
-        settings: length and rates.
-        checkpoint: file that holds the state at every report. Where it is there already, training goes on from it, and
-            ends with the same weights as without a pause.
+        settings: length, rates and device.
+        checkpoint: file that holds the state at every report, and in the end the returned weights alone. Where it is
+            there already, training goes on from it, and ends with the same weights as without a pause.
+
+    Raises:
+        ModelError: the checkpoint is that of a finished training of another length.
     """
-    network.train()
+    if checkpoint and is_finished(checkpoint, settings.steps):
+        return load_finished(network, checkpoint)
+    network.train().to(settings.device)
     if settings.channels_last:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network)
@@ -62,25 +78,49 @@ def fit(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=(0.9, 0.99)
     )
     state = _State(network=network, average=average, optimiser=optimiser)
-    first = state.load(checkpoint) if checkpoint and checkpoint.is_file() else 0
-    recent: list[float] = []
+    first = state.load(checkpoint, settings.device) if checkpoint and checkpoint.is_file() else 0
+    device = torch.device(settings.device)
+    precision = settings.precision or best_precision(device)
+    recent: list[torch.Tensor] = []
     for step, batch in enumerate(_prefetched(make_batch, settings, first=first), first):
         for group in optimiser.param_groups:
             group["lr"] = settings.learning_rate * rate_at(step, settings.steps)
-        with torch.autocast("cpu", settings.precision, enabled=settings.precision != torch.float32):
-            loss = loss_of(network, batch)
+        with torch.autocast(device.type, precision, enabled=precision != torch.float32):
+            loss = loss_of(network, batch if device.type == "cpu" else batch.to(device))
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 10.0)
         optimiser.step()
         _update_average(average, network, min(settings.average_decay, (step + 1) / (step + 10)))
-        recent.append(float(loss.detach()))
+        # Read at reports alone: to read is to wait for the device.
+        recent.append(loss.detach())
         if (step + 1) % settings.report_every == 0:
-            print(f"  {settings.name}: step {step + 1} of {settings.steps}, loss {np.mean(recent):.4f}", flush=True)
+            mean = float(torch.stack(recent).mean())
+            print(f"  {settings.name}: step {step + 1} of {settings.steps}, loss {mean:.4f}", flush=True)
             recent.clear()
             if checkpoint:
                 state.save(checkpoint, step + 1)
-    return average.eval()
+    average.cpu().eval()
+    if checkpoint:
+        _save({"finished": settings.steps, "average": average.state_dict()}, checkpoint)
+    return average
+
+
+def best_precision(device: torch.device) -> torch.dtype:
+    """bfloat16, but float32 on processors without instructions for it, which are seven times slower in bfloat16."""
+    fast = device.type != "cpu" or torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    return torch.bfloat16 if fast else torch.float32
+
+
+def is_finished(checkpoint: Path, steps: int) -> bool:
+    """Whether the file holds what a training of so many steps ended with."""
+    return checkpoint.is_file() and torch.load(checkpoint, weights_only=True, mmap=True).get("finished") == steps
+
+
+def load_finished(network: nn.Module, checkpoint: Path) -> nn.Module:
+    """The network with the weights that its training ended with."""
+    network.load_state_dict(torch.load(checkpoint, weights_only=True)["average"])
+    return network.eval()
 
 
 def rate_at(step: int, steps: int) -> float:
@@ -91,16 +131,33 @@ def rate_at(step: int, steps: int) -> float:
     return 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, steps - warm)))
 
 
-def _prefetched(make_batch: BatchMaker, settings: FitSettings, *, first: int = 0, ahead: int = 3) -> Iterator[Any]:
-    def batch_of(step: int) -> Any:
-        return make_batch(np.random.default_rng((settings.seed, step)))
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _SeededBatches(Dataset[Any]):
+    """Batch by step."""
 
+    make_batch: BatchMaker
+    seed: int
+
+    def __getitem__(self, index: int) -> Any:
+        return self.make_batch(np.random.default_rng((self.seed, index)))
+
+
+def _prefetched(make_batch: BatchMaker, settings: FitSettings, *, first: int = 0) -> Iterator[Any]:
+    batches = _SeededBatches(make_batch=make_batch, seed=settings.seed)
+    steps = range(first, settings.steps)
+    if settings.loaders:
+        # Forked, so that the pool, which is gigabytes, is shared and not sent.
+        yield from DataLoader(
+            batches, batch_size=None, sampler=steps, num_workers=settings.loaders, prefetch_factor=_AHEAD,
+            pin_memory=settings.device != "cpu", multiprocessing_context="fork",
+        )  # fmt: skip
+        return
     with ThreadPoolExecutor(1) as pool:
-        waiting = [pool.submit(batch_of, step) for step in range(first, min(first + ahead, settings.steps))]
-        for step in range(first, settings.steps):
+        waiting = [pool.submit(batches.__getitem__, step) for step in steps[:_AHEAD]]
+        for step in steps:
             batch = waiting.pop(0).result()
-            if step + ahead < settings.steps:
-                waiting.append(pool.submit(batch_of, step + ahead))
+            if step + _AHEAD in steps:
+                waiting.append(pool.submit(batches.__getitem__, step + _AHEAD))
             yield batch
 
 
@@ -114,23 +171,27 @@ class _State:
 
     def save(self, path: Path, steps: int) -> None:
         parts = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
-        scratch = path.with_suffix(".part")
-        torch.save({"steps": steps} | {name: part.state_dict() for name, part in parts.items()}, scratch)
-        scratch.replace(path)
+        _save({"steps": steps} | {name: part.state_dict() for name, part in parts.items()}, path)
 
-    def load(self, path: Path) -> int:
+    def load(self, path: Path, device: str) -> int:
         """Steps done."""
-        kept = torch.load(path, weights_only=True)
+        kept = torch.load(path, weights_only=True, map_location=device)
+        if "steps" not in kept:
+            raise ModelError(f"{path}: finished after {kept['finished']} steps; remove it to train for another length")
         self.network.load_state_dict(kept["network"])
         self.average.load_state_dict(kept["average"])
         self.optimiser.load_state_dict(kept["optimiser"])
         return int(kept["steps"])
 
 
+def _save(content: dict[str, Any], path: Path) -> None:
+    scratch = path.with_suffix(".part")
+    torch.save(content, scratch)
+    scratch.replace(path)
+
+
 @torch.no_grad()
 def _update_average(average: nn.Module, network: nn.Module, decay: float) -> None:
-    for mean, value in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
-        if mean.dtype.is_floating_point:
-            mean.lerp_(value, 1 - decay)
-        else:
-            mean.copy_(value)
+    pairs = zip(average.state_dict().values(), network.state_dict().values(), strict=True)
+    means, values = zip(*[pair for pair in pairs if pair[0].dtype.is_floating_point], strict=True)
+    torch._foreach_lerp_(means, values, 1 - decay)

@@ -4,16 +4,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-_IGNORED = -2
 
-
-def detector_loss(rows: Tensor, classes: Tensor, boxes_xyxy: Tensor, cells: Tensor, strides: Tensor) -> Tensor:
+def detector_loss(
+    rows: Tensor, classes: Tensor, boxes_xyxy: Tensor, weights: Tensor, cells: Tensor, strides: Tensor
+) -> Tensor:
     """Overlap, objectness and class losses of a grid detector (Ge et al. 2021, with fixed assignment).
 
     Args:
         rows: (N, A, 5 + C) as ``StreetDetector`` gives them.
         classes: (N, A) int64 as in ``GridTargets``.
         boxes_xyxy: (N, A, 4) input pixels.
+        weights: (N, A) as in ``GridTargets``.
         cells: (A, 2) column and row of each cell.
         strides: (A,) pixels per cell.
     """
@@ -29,10 +30,18 @@ def detector_loss(rows: Tensor, classes: Tensor, boxes_xyxy: Tensor, cells: Tens
     # boxes are never exact.
     objectness[sample, cell] = overlap.detach().clamp(min=0.25).sqrt()
     entropy = functional.binary_cross_entropy_with_logits(rows[..., 4], objectness, reduction="none")
-    entropy = (entropy * (classes != _IGNORED)).sum() / count
-    names = functional.one_hot(classes[sample, cell], rows.shape[2] - 5).float()
-    naming = functional.binary_cross_entropy_with_logits(picked[:, 5:], names, reduction="sum") / count
-    return 3 * (1 - generalised).sum() / count + entropy + 0.5 * naming
+    entropy = (entropy * weights).sum() / count
+    naming = _naming(picked[:, 5:], classes[sample, cell]).sum() / count
+    uncounted = classes < -1
+    # A slice of a car at the picture's edge need not be found, but is no person either.
+    hinted = (_naming(rows[..., 5:], (-2 - classes).clamp(min=0)) * uncounted).sum() / uncounted.sum().clamp(min=1)
+    return 3 * (1 - generalised).sum() / count + entropy + 0.5 * (naming + hinted)
+
+
+def _naming(logits: Tensor, classes: Tensor) -> Tensor:
+    """(...,) cross-entropy of class logits (..., C)."""
+    names = functional.one_hot(classes, logits.shape[-1]).to(logits)
+    return functional.binary_cross_entropy_with_logits(logits, names, reduction="none").sum(dim=-1)
 
 
 def _overlaps(boxes: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
@@ -66,7 +75,7 @@ def simcc_loss(
         hidden_weight: of hidden points in the score's loss: above 1, a point in doubt scores lower than its chances.
     """
     total = weights.sum().clamp(min=1)
-    loss = torch.zeros(())
+    loss = outputs[2].new_zeros(())
     off = []
     for logits, response in zip(outputs[:2], responses, strict=True):
         loss = loss - ((response * logits.log_softmax(dim=2)).sum(dim=2) * weights).sum() / total
@@ -92,7 +101,7 @@ def field_loss(field: Tensor, places: Tensor, values: Tensor) -> Tensor:
     target[picture, row, y, x] = 1
     # Not focal: the decoder adds confidences up, and focal loss leaves them timid.
     entropy = functional.binary_cross_entropy_with_logits(confidence, target, reduction="sum")
-    parts = torch.arange(1, 1 + width)
+    parts = torch.arange(1, 1 + width, device=field.device)
     picked = field[picture[:, None], row[:, None], parts, y[:, None], x[:, None]].float()
     offsets = 2 * width // 3
     places_off = functional.smooth_l1_loss(picked[:, :offsets], values[:, :offsets], beta=0.1, reduction="sum")

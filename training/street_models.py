@@ -1,17 +1,24 @@
 """Train, export and judge the small shipped extractors of the synthetic street: ``python -m training.street_models``.
 
-Everything follows from the seeds: pool, batches, weights, ONNX bytes (on one kind of processor), thresholds, figures.
-With ``--checkpoints FOLDER`` a run that was stopped goes on where it was, and ends with the same files.
+On processors everything follows from the seeds: pool, batches, weights, ONNX bytes (on one kind of processor),
+thresholds, figures. On a GPU (``--device cuda``), from which the shipped weights come, pool and batches do; its sums,
+and so the weights, differ in their last digits from run to run. With ``--checkpoints FOLDER`` a run that was stopped
+goes on where it was; of models whose training has ended, it exports and judges what is there, without a GPU.
 """
 
 import argparse
 import ctypes
 import json
+import os
 import resource
+import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import torch
@@ -19,62 +26,68 @@ import torch
 from labeling.detection import Detector
 from labeling.fields import FieldModel
 from labeling.keypoints import KeypointHead
-from labeling.model_cards import SHIPPED_CARDS, ModelCard, SimccCard, YoloxCard, read_card
+from labeling.model_cards import SHIPPED_CARDS, SimccCard, YoloxCard, read_card
 from labeling.model_cards import write_card as write_model_card
 from training.street_export import export_model
-from training.street_fitting import fit
+from training.street_fitting import fit, is_finished, load_finished
 from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, judging_frames, plan_lessons
 from training.street_pool import StreetPool, render_pool
-from training.street_recipes import MODEL_NAMES, ModelName, Recipe, recipe
+from training.street_recipes import BUDGETS, MODEL_NAMES, Device, ModelName, Recipe, recipe
 from training.street_scores import StreetModels, Tally, judge_frame
 from training.street_thresholds import choose_thresholds
 
-WORKERS = 2
-"""Processes that render and train."""
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 """Of mallopt(3)."""
 JUDGED_FRAMES = 6
 """Of each street that chooses thresholds or judges."""
+_CHOOSING = 2
+"""Times as many streets choose the thresholds as judge them."""
 
 
-def train_model(plan: Recipe, pool: StreetPool, folder: Path, *, checkpoints: Path | None = None) -> ModelCard:
-    """Train by the recipe and write the ONNX file and its card (without figures) into ``folder``."""
-    torch.manual_seed(plan.fit.seed)
-    kept = checkpoints / f"{plan.card.name}.pt" if checkpoints else None
-    network = fit(plan.network(), plan.batches(pool), plan.loss, plan.fit, checkpoint=kept)
-    return export_model(plan.graph(network), plan.card, folder)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    """One model to train, in a process of its own."""
+
+    name: ModelName
+    device: Device
+    seed: int
+    share: float
+    checkpoints: Path
+
+    @property
+    def plan(self) -> Recipe:
+        return recipe(self.name, device=self.device, seed=self.seed, share=self.share)
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.checkpoints / f"{self.name}.pt"
+
+    @property
+    def is_finished(self) -> bool:
+        return is_finished(self.checkpoint, self.plan.fit.steps)
 
 
 _shared_pool: list[StreetPool] = []
-_Job = tuple[ModelName, Path, Path | None, int, float]
 
 
-def train_models(
-    names: Sequence[ModelName],
-    pool: StreetPool,
-    folder: Path,
-    *,
-    seed: int,
-    share: float,
-    checkpoints: Path | None = None,
-    workers: int = WORKERS,
-) -> None:
-    """Train several models side by side, one thread each, in the order given; no model's bytes depend on company."""
+def _train_models(jobs: Sequence[_Job], pool: StreetPool, *, at_once: int) -> None:
+    """Train models side by side, one thread each, in the order given; no model's weights depend on company."""
     _shared_pool[:] = [pool]
-    jobs: list[_Job] = [(name, folder, checkpoints, seed, share) for name in names]
     # Forked workers see the pool where it is: it would take longer to send than to render.
-    with get_context("fork").Pool(min(workers, len(jobs)), maxtasksperchild=1) as processes:
-        for name, seconds in processes.imap_unordered(_train_job, jobs):
-            print(f"{name} trained and exported in {seconds:.0f} s", flush=True)
+    with ProcessPoolExecutor(min(at_once, len(jobs)), mp_context=get_context("fork")) as processes:
+        for name, seconds in processes.map(_train, jobs):
+            print(f"{name} trained in {seconds:.0f} s", flush=True)
 
 
-def _train_job(job: _Job) -> tuple[str, float]:
-    name, folder, checkpoints, seed, share = job
+def _train(job: _Job) -> tuple[str, float]:
     torch.set_num_threads(1)
+    torch.backends.cudnn.benchmark = True
     _keep_memory()
     start = time.perf_counter()
-    train_model(recipe(name, seed=seed, share=share), _shared_pool[0], folder, checkpoints=checkpoints)
-    return name, time.perf_counter() - start
+    plan = job.plan
+    torch.manual_seed(plan.fit.seed)
+    fit(plan.network(), plan.batches(_shared_pool[0]), plan.loss, plan.fit, checkpoint=job.checkpoint)
+    return job.name, time.perf_counter() - start
 
 
 def _keep_memory() -> None:
@@ -128,18 +141,26 @@ def write_figures(folder: Path, figures: dict[str, float], *, frames: int) -> No
 
 
 def train_all(options: argparse.Namespace) -> None:
-    """The pool, the models that ``--only`` names, and their thresholds."""
-    start = time.perf_counter()
-    pool = render_pool(plan_lessons(TRAIN_SEED, options.streets, frames=7, every=15), workers=options.workers)
-    counts = {name: len(found) for name, found in pool.crops.items()}
-    print(f"{len(pool.frames)} frames, crops {counts}, {time.perf_counter() - start:.0f} s", flush=True)
-    if options.checkpoints:
-        options.checkpoints.mkdir(parents=True, exist_ok=True)
-    train_models(
-        options.only, pool, options.out, seed=options.seed, share=options.share, checkpoints=options.checkpoints,
-        workers=options.workers,
-    )  # fmt: skip
-    frames = list(judging_frames(VALIDATION_SEED, options.judged_streets, JUDGED_FRAMES))
+    """Train those models that ``--only`` names and no checkpoint holds."""
+    budget = BUDGETS[options.device]
+    jobs = [
+        _Job(name=name, device=options.device, seed=options.seed, share=options.share, checkpoints=options.checkpoints)
+        for name in options.only
+    ]
+    missing = [job for job in jobs if not job.is_finished]
+    if missing:
+        start = time.perf_counter()
+        plans = plan_lessons(TRAIN_SEED, options.streets or budget.streets, frames=7, every=15)
+        pool = render_pool(plans, workers=options.workers)
+        counts = {name: len(found) for name, found in pool.crops.items()}
+        print(f"{len(pool.frames)} frames, crops {counts}, {time.perf_counter() - start:.0f} s", flush=True)
+        _train_models(missing, pool, at_once=budget.jobs)
+    if options.train_only:
+        return
+    for job in jobs:
+        plan = job.plan
+        export_model(plan.graph(load_finished(plan.network(), job.checkpoint)), plan.card, options.out)
+    frames = list(judging_frames(VALIDATION_SEED, _CHOOSING * options.judged_streets, JUDGED_FRAMES))
     choose_thresholds(options.out, options.only, frames)
 
 
@@ -147,21 +168,31 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Train what is asked for, then judge it; ``--evaluate`` only judges."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=MODEL_NAMES, default=MODEL_NAMES)
+    parser.add_argument("--device", choices=get_args(Device), default="cpu", help="which also says how much is learnt")
     parser.add_argument("--evaluate", action="store_true", help="judge what is there, train nothing")
+    parser.add_argument("--train-only", action="store_true", help="end with the weights in --checkpoints")
     parser.add_argument("--out", type=Path, default=SHIPPED_CARDS)
-    parser.add_argument("--checkpoints", type=Path, help="folder from which a stopped run goes on")
+    parser.add_argument("--checkpoints", type=Path, help="folder of weights, from which a stopped run goes on")
     parser.add_argument("--results", type=Path, help="JSON file for the figures and the time")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--streets", type=int, default=384, help="streets to learn from, 7 frames each")
+    parser.add_argument("--streets", type=int, help="to learn from, 7 frames each; by default as the device allows")
     parser.add_argument("--judged-streets", type=int, default=30)
     parser.add_argument("--share", type=float, default=1.0, help="share of the full number of steps")
-    parser.add_argument("--workers", type=int, default=WORKERS, help="processes that render and train")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes that render")
     options = parser.parse_args(arguments)
+    if options.train_only and not options.checkpoints:
+        parser.error("--train-only leaves nothing behind without --checkpoints FOLDER")
     cv2.setNumThreads(1)
     options.out.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     if not options.evaluate:
-        train_all(options)
+        with tempfile.TemporaryDirectory() as scratch:
+            options.checkpoints = options.checkpoints or Path(scratch)
+            options.checkpoints.mkdir(parents=True, exist_ok=True)
+            train_all(options)
+    if options.train_only:
+        print(f"{time.perf_counter() - start:.0f} s")
+        return
     figures = evaluate(options.out, streets=options.judged_streets)
     write_figures(options.out, figures, frames=options.judged_streets * JUDGED_FRAMES)
     for key, value in figures.items():

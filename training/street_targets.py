@@ -13,9 +13,14 @@ from training.street_networks import DETECTOR_STRIDES
 
 LEVEL_LIMITS_PX = (0.0, 40.0, 88.0, np.inf)
 """Root of the box area from which each stride of the detector is responsible, input pixels."""
-CENTRE_RADIUS = 0.6
-"""Strides from an object's middle to the cells that are responsible for it: nearly always one cell. With 1 or 1.5, up
-to nine, neighbours quarrel over whose object it is, and fewer people are found."""
+CENTRE_RADIUS = 0.501
+"""Strides from an object's middle to the cells that are responsible for it: one cell, or both on whose border it lies.
+With 1 or 1.5, up to nine, neighbours quarrel over whose object it is, and fewer people are found."""
+_NEAR_SIGMA = 0.6
+"""Strides: how near an object's middle a cell, not responsible for it, may take it for its own unpunished. Where a
+middle lies on the border of two cells, which of them it is in is a toss."""
+_NEAR_LEVEL = 0.2
+"""Octaves of an object's size: as above, of the strides."""
 _FIELD_WINDOW = 4
 """Cells along each side of the square that votes for a point: 16 votes of c / 16 make a whole one."""
 
@@ -25,9 +30,13 @@ class GridTargets:
     """A detector's targets in one picture."""
 
     classes: np.ndarray
-    """(A,) int64: class of the object a cell is responsible for, -1 background, -2 not counted in the loss."""
+    """(A,) int64: class of the object a cell is responsible for, -1 background, -2 - class on an object that does not
+    count: nothing is said there of whether it is one, but of what it is."""
     boxes_xyxy: np.ndarray
     """(A, 4) float32; zero where there is no object."""
+    weights: np.ndarray
+    """(A,) float32 0 to 1: of each cell in the loss of whether there is an object. Near a middle less, as Law and Deng
+    2018 (CornerNet) weigh theirs; 0 on what does not count."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,35 +75,61 @@ def encode_boxes(
     width: int,
     height: int,
     radius: float = CENTRE_RADIUS,
+    soften: bool = True,
 ) -> GridTargets:
-    """Give each object the cells around its middle, on the stride that suits its size.
+    """Give each object the cell in its middle, on the stride that suits its size.
 
     Args:
         boxes_xyxy: (n, 4), inside the picture.
         classes: (n,) class indices.
-        counted: (n,) bool; cells inside the box of an object that is not counted are left out of the loss.
+        counted: (n,) bool; cells inside the box of an object that is not counted need not find it.
         width: of the picture, a multiple of 32.
         height: of the picture.
         radius: strides from the middle to the cells that are the object's.
+        soften: let cells weigh less that are nearly responsible.
     """
     shapes = [(height // stride, width // stride) for stride in DETECTOR_STRIDES]
     found = [np.full(shape, -1, np.int64) for shape in shapes]
     boxes = [np.zeros((*shape, 4), np.float32) for shape in shapes]
-    for box in boxes_xyxy[~counted]:
-        for level, stride in zip(found, DETECTOR_STRIDES, strict=True):
-            level[_cells_within(box, stride)] = -2
+    weights = [np.ones(shape, np.float32) for shape in shapes]
+    for index in np.flatnonzero(~counted):
+        for classes_at, weights_at, stride in zip(found, weights, DETECTOR_STRIDES, strict=True):
+            covered = _cells_within(boxes_xyxy[index], stride)
+            classes_at[covered], weights_at[covered] = -2 - classes[index], 0
     sizes = np.sqrt(np.prod(boxes_xyxy[:, 2:] - boxes_xyxy[:, :2], axis=1))
+    if soften:
+        for weights_at, stride, octaves in zip(weights, DETECTOR_STRIDES, _octaves_off(sizes), strict=True):
+            for index in np.flatnonzero(counted & (octaves < 3 * _NEAR_LEVEL)):
+                _soften(weights_at, boxes_xyxy[index], stride, octaves[index])
     # The smaller object takes a cell that two claim: the larger has others.
     for index in sorted(np.flatnonzero(counted), key=lambda i: -sizes[i]):
         box, level = boxes_xyxy[index], int(np.searchsorted(LEVEL_LIMITS_PX, sizes[index], side="right")) - 1
         stride = DETECTOR_STRIDES[level]
         centre, reach = np.tile((box[:2] + box[2:]) / 2, 2), radius * stride
         mine = _cells_within(centre + np.array([-reach, -reach, reach, reach]), stride)
-        found[level][mine], boxes[level][mine] = classes[index], box
+        found[level][mine], boxes[level][mine], weights[level][mine] = classes[index], box, 1
     return GridTargets(
         classes=np.concatenate([level.ravel() for level in found]),
         boxes_xyxy=np.concatenate([level.reshape(-1, 4) for level in boxes]),
+        weights=np.concatenate([level.ravel() for level in weights]),
     )
+
+
+def _octaves_off(sizes: np.ndarray) -> np.ndarray:
+    """(strides, n) how far boxes, by the roots of their areas (n,), are from those that each stride is responsible
+    for."""
+    lowest, highest = np.array(LEVEL_LIMITS_PX[:-1])[:, None], np.array(LEVEL_LIMITS_PX[1:])[:, None]
+    return np.log2(np.maximum(1, np.maximum(lowest / sizes, sizes / highest)))
+
+
+def _soften(weights: np.ndarray, box_xyxy: np.ndarray, stride: int, octaves: float) -> None:
+    """Lower the weights (h, w) of a stride's cells around the middle of a box."""
+    column, row = ((box_xyxy[:2] + box_xyxy[2:]) / 2 / stride - 0.5).tolist()
+    left, top = max(0, round(column) - 2), max(0, round(row) - 2)
+    patch = weights[top : round(row) + 3, left : round(column) + 3]
+    y, x = np.arange(top, top + patch.shape[0])[:, None], np.arange(left, left + patch.shape[1])
+    distance = ((x - column) ** 2 + (y - row) ** 2) / _NEAR_SIGMA**2 + (octaves / _NEAR_LEVEL) ** 2
+    np.minimum(patch, (1 - np.exp(-distance / 2)) ** 2, out=patch)
 
 
 def _cells_within(box_xyxy: np.ndarray, stride: int) -> tuple[slice, slice]:

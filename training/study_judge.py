@@ -164,7 +164,9 @@ def train_judge(clips: Sequence[JudgeClip], *, detector_steps: int, pair_steps: 
     fit_detector = FitSettings(seed=seed, steps=detector_steps, learning_rate=3e-3, average_decay=0.98, name="detector")
     fitted = fit(
         detector, lambda rng: detector_batch(clips, rng),
-        lambda network, batch: detector_loss(network(batch[0]).float(), batch[1], batch[2], cells, strides),
+        lambda network, batch: detector_loss(
+            network(batch[0]).float(), batch[1], batch[2], batch[3], cells, strides
+        ),
         fit_detector,
     )  # fmt: skip
     fit_pair = FitSettings(
@@ -181,9 +183,9 @@ def train_judge(clips: Sequence[JudgeClip], *, detector_steps: int, pair_steps: 
 
 def detector_batch(
     clips: Sequence[JudgeClip], rng: np.random.Generator
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Pictures (N, 3, 2H, 2W), classes (N, A) and boxes (N, A, 4); half of them mirrored."""
-    pictures, classes, boxes = [], [], []
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Pictures (N, 3, 2H, 2W), classes (N, A), boxes (N, A, 4) and weights (N, A); half of them mirrored."""
+    pictures, classes, boxes, weights = [], [], [], []
     for _ in range(_BATCH):
         clip = clips[int(rng.integers(len(clips)))]
         video = clip.videos[int(rng.integers(len(clip.videos)))]
@@ -195,14 +197,21 @@ def detector_batch(
             truth = np.stack([width - 1 - truth[:, 2], truth[:, 1], width - 1 - truth[:, 0], truth[:, 3]], axis=1)
         inside = np.clip(truth, 0, np.array([width, height, width, height], np.float32))
         goal = encode_boxes(
-            inside, np.zeros(len(truth), np.int64), clip.counted[index], width=width, height=height, radius=_RADIUS
+            inside,
+            np.zeros(len(truth), np.int64),
+            clip.counted[index],
+            width=width,
+            height=height,
+            radius=_RADIUS,
+            soften=False,
         )
         pictures.append(np.clip(picture * rng.uniform(0.85, 1.15) + rng.uniform(-12, 12), 0, 255).astype(np.uint8))
-        classes.append(goal.classes)
+        # There is one class alone: what an uncounted object is need not be said.
+        classes.append(np.maximum(goal.classes, -1))
         boxes.append(goal.boxes_xyxy)
-    return (
-        _network_pictures(np.stack(pictures)), torch.from_numpy(np.stack(classes)), torch.from_numpy(np.stack(boxes))
-    )  # fmt: skip
+        weights.append(goal.weights)
+    classes_at, boxes_at, weights_at = (torch.from_numpy(np.stack(part)) for part in (classes, boxes, weights))
+    return _network_pictures(np.stack(pictures)), classes_at, boxes_at, weights_at
 
 
 def pair_batch(clips: Sequence[JudgeClip], rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from labeling.box_tracker import iou
+from labeling.boxes import iou
 from training.evaluation import trajectory_scores
 from training.study_judge import Reading
 
