@@ -40,7 +40,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 """Of mallopt(3)."""
 JUDGED_FRAMES = 6
 """Of each street that chooses thresholds or judges."""
-_CHOOSING = 2
+_CHOOSING = 3
 """Times as many streets choose the thresholds as judge them."""
 
 

@@ -14,10 +14,12 @@ from training.street_scores import Tally, is_judged, judge_car_fields, judge_lan
 
 BOX_SCORES = tuple(float(value) for value in np.round(np.arange(0.1, 0.76, 0.05), 2))
 """Of boxes, to choose from."""
+SURE_SCORES = tuple(float(value) for value in np.round(np.arange(0.1, 0.8, 0.01), 2))
+"""Of boxes, from which a track may begin, to choose from."""
 OBJECT_SCORES = tuple(float(value) for value in np.round(np.arange(0.16, 0.45, 0.03), 2))
 """Of bottom-up objects, to choose from."""
-_LUCK = 0.015
-_FEW_PHANTOMS = 0.02
+_LUCK = 0.01
+_FEW_PHANTOMS = 0.01
 """Per frame and class: what a track may begin with. One phantom that is believed is shown for as long as it lasts."""
 JudgedFrame = tuple[np.ndarray, tuple[ObjectTruth, ...]]
 """(H, W, 3) uint8 RGB, and what is true in it."""
@@ -51,11 +53,12 @@ def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFram
         for name in card.class_names:
             seen = found.select(found.classes == name)
             mine = [truth for truth in truths if truth.category == card.categories[name]]
-            judged = [judge_count(seen, mine, threshold) for threshold in BOX_SCORES]
-            exact[name].append([missed + extra == 0 for missed, extra in judged])
-            phantoms[name].append([extra for _, extra in judged])
+            exact[name].append([sum(judge_count(seen, mine, threshold)) == 0 for threshold in BOX_SCORES])
+            phantoms[name].append([judge_count(seen, mine, threshold)[1] for threshold in SURE_SCORES])
     best = {name: best_threshold(np.mean(rows, axis=0), BOX_SCORES) for name, rows in exact.items()}
-    sure = {name: max(best[name], sure_threshold(np.mean(rows, axis=0), BOX_SCORES)) for name, rows in phantoms.items()}
+    sure = {
+        name: max(best[name], sure_threshold(np.mean(rows, axis=0), SURE_SCORES)) for name, rows in phantoms.items()
+    }
     return card.model_copy(
         update={"score_threshold": min(best.values()), "score_thresholds": best, "sure_scores": sure}
     )
