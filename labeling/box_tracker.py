@@ -41,8 +41,9 @@ class TrackerSettings:
     """The same for tracks that have not been seen for a while: their prediction is less sure."""
     lost_cost: float = 0.1
     """Added to what it costs to match a lost track: between equals, the one that was just seen goes first."""
-    back_cost: float = 0.5
-    """Added for a lost track that would have had to turn back by its own size: people come out where they went to."""
+    back_cost: float = 0.8
+    """Added for a track that is lost or seen in part and would have had to turn back by its own size: people come out
+    where they went to, and of one who goes behind a column, the last that shows is where the next comes out."""
     min_overlap: float = 0.15
     """Least IoU of the buffered boxes."""
     max_lost_frames: int = 36
@@ -120,7 +121,7 @@ class BoxTracker:
         seen = [track for track in self._tracks if track.lost_frames <= frame_step]
         # Lost ones have a say too: where one person goes behind a column another may just come out.
         high = self._associate(self._tracks, boxes, ids, high, frame_step)
-        unmatched = [track for track in seen if track.lost_frames]
+        unmatched = [track for track in self._tracks if track.lost_frames]
         self._associate(unmatched, boxes, ids, low, frame_step)
         for index in high:
             ids[index] = self._start(boxes[index])
@@ -147,8 +148,10 @@ class BoxTracker:
         overlap = np.where(lost, far, near)
         heights = np.log(_heights(boxes[chosen])[None] / _heights(predicted)[:, None])
         allowed = (overlap >= settings.min_overlap) & (np.abs(heights) <= np.log(settings.max_size_ratio))
-        back = np.stack([_turned_back(track, boxes[chosen]) for track in tracks])
-        cost = np.minimum(1 - overlap + lost * (settings.lost_cost + settings.back_cost * back), _UNMATCHED)
+        back = np.stack(
+            [_turned_back(track, boxes[chosen], lost=bool(gone)) for track, gone in zip(tracks, lost, strict=True)]
+        )
+        cost = np.minimum(1 - overlap + lost * settings.lost_cost + settings.back_cost * back, _UNMATCHED)
         rows, columns = linear_sum_assignment(np.where(allowed, cost, _UNMATCHED))
         taken = np.zeros(len(chosen), bool)
         for row, column in zip(rows, columns, strict=True):
@@ -175,9 +178,15 @@ class BoxTracker:
         return self.next_id - 1
 
 
-def _turned_back(track: _Track, boxes_xyxy: np.ndarray) -> np.ndarray:
-    """(N,) by how much of its size each of (N, 4) boxes lies behind where a track is expected, against its motion."""
-    (centre, velocity), size = track.mean[:2].T, np.exp(np.clip(track.mean[2:, 0], -3, 9))
+def _turned_back(track: _Track, boxes_xyxy: np.ndarray, *, lost: bool) -> np.ndarray:
+    """(N,) by how much of its size each of (N, 4) boxes lies behind where a track is expected, against its motion.
+
+    What was just seen whole may turn: 0.
+    """
+    state = track.mean if lost else _line_while_partly_hidden(track)
+    if state is None:
+        return np.zeros(len(boxes_xyxy))
+    (centre, velocity), size = state[:2].T, np.exp(np.clip(state[2:, 0], -3, 9))
     speed = float(np.hypot(*velocity))
     if speed < _SLOW_PX:
         return np.zeros(len(boxes_xyxy))
@@ -213,24 +222,43 @@ def _remember(track: _Track, box_xyxy: np.ndarray) -> None:
 
 
 def _coast(track: _Track) -> None:
-    """Let an object that went behind something go on as it went before.
+    """Let an object that went behind something go on as it went before."""
+    line = _line(track)
+    if line is not None:
+        track.mean = line
 
-    Its last boxes are what was left in view: their middle stops at the edge of what hides it. The line through most
-    sightings does not (Theil 1950, Sen 1968: the median of the slopes of pairs, of which three in ten may be wrong).
-    """
+
+def _line_while_partly_hidden(track: _Track) -> np.ndarray | None:
+    """The line of a track whose last sighting was of a part; None for one that was seen whole, or has no line."""
+    return None if _seen_whole(track)[-1] else _line(track)
+
+
+def _seen_whole(track: _Track) -> np.ndarray:
+    """(n,) which sightings are of the whole object."""
     usual = np.median(track.past[:, 3:], axis=0)
-    whole = (track.past[:, 3:] >= usual + np.log(_WHOLE_SHARE)).all(axis=1)
+    return (track.past[:, 3:] >= usual + np.log(_WHOLE_SHARE)).all(axis=1)
+
+
+def _line(track: _Track) -> np.ndarray | None:
+    """(4, 2) state of an object that goes on as it went while it was seen whole; None where nothing tells how.
+
+    Its last boxes before something hides it are what was left in view: their middle stops at the edge of that. The line
+    through most sightings does not (Theil 1950, Sen 1968: the median of the slopes of pairs, of which three in ten may
+    be wrong).
+    """
+    whole = _seen_whole(track)
     ago, places = -track.past[whole, 0], track.past[whole, 1:]
     first, second = np.triu_indices(len(ago), 1)
     apart = ago[second] - ago[first]
     far = apart >= _LEVER_FRAMES
     if not far.any():
-        return
+        return None
     slopes = np.median((places[second] - places[first])[far] / apart[far, None], axis=0)
     if abs(slopes[3]) > _STEADY_GROWTH:
-        return
-    track.mean[:2] = np.stack([np.median(places[:, :2] - slopes[:2] * ago[:, None], axis=0), slopes[:2]], axis=1)
-    track.mean[2:] = np.stack([np.median(places[:, 2:], axis=0), np.zeros(2)], axis=1)
+        return None
+    centre = np.median(places[:, :2] - slopes[:2] * ago[:, None], axis=0)
+    size = np.median(places[:, 2:], axis=0)
+    return np.stack([np.concatenate([centre, size]), np.array([*slopes[:2], 0.0, 0.0])], axis=1)
 
 
 def _predict(track: _Track, steps: int) -> None:

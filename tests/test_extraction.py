@@ -88,11 +88,13 @@ def test_no_label_is_covered_by_a_better_one_of_its_kind() -> None:
         replace(card.label(3), track_id=0),
         replace(card.label(3), track_id=2, box_xyxy=np.array([200.0, 70, 296, 142], np.float32)),
     )
-    over = replace(first, track_id=1, score=0.5, box_xyxy=first.box_xyxy + 10)
+    over = replace(first, track_id=1, score=0.5, box_xyxy=first.box_xyxy + 6)
     other = replace(over, category="person", track_id=3)
     later = replace(over, frame=4)
-    kept = without_doubles([over, first, far, other, later])
-    assert [(label.frame, label.track_id) for label in kept] == [(3, 0), (3, 2), (3, 3), (4, 1)]
+    # Half a box is what two cars in view may share.
+    beside = replace(over, track_id=4, box_xyxy=first.box_xyxy + np.array([32, 0, 32, 0], np.float32))
+    kept = without_doubles([over, first, far, other, later, beside])
+    assert [(label.frame, label.track_id) for label in kept] == [(3, 0), (3, 2), (3, 3), (3, 4), (4, 1)]
 
 
 def test_what_a_coder_changes_is_the_same_picture_and_noise_is_not() -> None:

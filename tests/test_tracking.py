@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from labeling.box_tracker import BoxTracker
+from labeling.box_tracker import BoxTracker, TrackerSettings
 from labeling.boxes import iou
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.lane_tracker import LaneTracker, line_distance
@@ -231,3 +231,36 @@ def test_lines_are_compared_where_the_turn_took_them() -> None:
     tracker = LaneTracker()
     assert tracker.update([lane(-150), lane(150)]).tolist() == [0, 1]
     assert tracker.update(turned, previous_to_current=shift).tolist() == [0, 1]
+
+
+def test_who_comes_out_where_another_went_in_is_not_the_same() -> None:
+    """Two people pass each other behind a column: slivers of one, then of the other, show at the same edge of it."""
+    left, right = 202.0, 378.0
+
+    def shown(middle: float, height: float) -> tuple[np.ndarray, float] | None:
+        start, end = middle - 35, middle + 35
+        if start < left < end:
+            end = left
+        elif start < right < end:
+            start = right
+        elif start >= left and end <= right:
+            return None
+        share = (end - start) / 70
+        return (np.array([start, 500 - height, end, 500]), 0.9 if share > 0.45 else 0.35) if share > 0.15 else None
+
+    tracker = BoxTracker(TrackerSettings(high_score=0.48))
+    ids: dict[str, list[int]] = {"leftward": [], "rightward": []}
+    for frame in range(75):
+        seen = {
+            name: found
+            for name, found in (
+                ("leftward", shown(600 - 6 * frame, 150)), ("rightward", shown(142 + 5.5 * frame, 170)),
+            )
+            if found is not None
+        }  # fmt: skip
+        boxes = np.array([box for box, _ in seen.values()]).reshape(-1, 4)
+        found = tracker.update(boxes, np.array([score for _, score in seen.values()]))
+        for name, track_id in zip(seen, found, strict=True):
+            ids[name].append(int(track_id))
+    assert set(ids["leftward"]) - {-1} == {0} and set(ids["rightward"]) - {-1} == {1}
+    assert min(len(found) for found in ids.values()) > 40
