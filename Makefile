@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 TEST_WORKERS ?= 2
+# What street-models trains on: cpu, or cuda with many cores beside it.
+DEVICE ?= cpu
 
 .PHONY: setup demo test lint check street-models benchmarks clean
 
@@ -30,7 +32,7 @@ lint: $(READY)
 check: test lint
 
 street-models: $(READY)
-	$(BIN)/python -m training.street_models
+	$(BIN)/python -m training.street_models --device $(DEVICE)
 
 clean:
 	rm -rf demo .pytest_cache .ruff_cache

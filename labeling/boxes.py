@@ -5,8 +5,19 @@ import numpy as np
 
 def iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
     """(N, M) intersection over union of (N, 4) and (M, 4) boxes, left top right bottom."""
+    shared = _shared(boxes_a, boxes_b)
+    return shared / np.maximum(_areas(boxes_a)[:, None] + _areas(boxes_b)[None] - shared, 1e-9)
+
+
+def inside(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
+    """(N, M) share of each of the (M, 4) boxes that each of the (N, 4) covers."""
+    return _shared(boxes_a, boxes_b) / np.maximum(_areas(boxes_b)[None], 1e-9)
+
+
+def _shared(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
     corner = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
-    sides = np.clip(np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:]) - corner, 0, None)
-    shared = sides.prod(axis=2)
-    area_a, area_b = ((boxes[:, 2:] - boxes[:, :2]).clip(0).prod(axis=1) for boxes in (boxes_a, boxes_b))
-    return shared / np.maximum(area_a[:, None] + area_b[None] - shared, 1e-9)
+    return np.clip(np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:]) - corner, 0, None).prod(axis=2)
+
+
+def _areas(boxes: np.ndarray) -> np.ndarray:
+    return (boxes[:, 2:] - boxes[:, :2]).clip(0).prod(axis=1)

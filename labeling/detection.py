@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from labeling.boxes import iou
-from labeling.model_cards import YoloxCard
+from labeling.boxes import inside, iou
+from labeling.model_cards import SoftSuppression, YoloxCard
 from labeling.onnx_model import DEFAULT_PROVIDERS, OnnxModel, check_frame, network_input
 from labeling.schemas import Category
 
@@ -132,7 +132,7 @@ def letterbox(frame: np.ndarray, card: YoloxCard) -> tuple[np.ndarray, float]:
 def decode_yolox(output: np.ndarray, card: YoloxCard, *, ratio: float, width: int, height: int) -> Detections:
     """Boxes of one frame from raw grid outputs (Ge et al. 2021, YOLOX): ``xy = (p + grid) s``, ``wh = exp(p) s``.
 
-    Doubles are cleared as the card says; with ``soft_nms`` scores are those that are left of the network's.
+    Doubles are cleared as the card says; with ``soft_nms``, scores are what is left of the network's.
 
     Args:
         output: (sum(hw/s^2), 5 + C) float32; objectness and class scores are sigmoid already.
@@ -149,7 +149,7 @@ def decode_yolox(output: np.ndarray, card: YoloxCard, *, ratio: float, width: in
     boxes = _decode_boxes(output[rows, :4], rows, card) / np.float32(ratio)
     # Doubles are cleared before boxes are cut: two objects that leave the picture must not become one.
     if card.soft_nms:
-        keep, values = soften_overlaps(boxes, values, class_ids, card.nms_threshold, least[class_ids])
+        keep, values = soften_overlaps(boxes, values, class_ids, card.soft_nms, least[class_ids])
     else:
         keep = suppress_overlaps(boxes, class_ids, card.nms_threshold)
     boxes = np.clip(boxes, 0, np.array([width, height, width, height], np.float32))
@@ -187,18 +187,19 @@ def suppress_overlaps(boxes_xyxy: np.ndarray, labels: np.ndarray, iou_threshold:
 
 
 def soften_overlaps(
-    boxes_xyxy: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou_threshold: float, least: np.ndarray
+    boxes_xyxy: np.ndarray, scores: np.ndarray, labels: np.ndarray, soft: SoftSuppression, least: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Soft non-maximum suppression within each label, linear (Bodla et al. 2017, equation 2).
+    """Soft non-maximum suppression within each label (Bodla et al. 2017, equation 3), and of parts.
 
-    A box that overlaps a better one keeps ``1 - IoU`` of its score, and goes where too little is left: of two that
-    overlap by half, a confident second one is an object that stands before or behind the first, a timid one its double.
+    A box that overlaps a better one keeps a share of its score, and goes where too little is left: of two that overlap
+    by half, a confident second one is an object that stands before or behind the first, a timid one its double. Overlap
+    says little of a small box in a large one, which may be a part of it: there what counts is how much of it is inside.
 
     Args:
         boxes_xyxy: (N, 4).
         scores: (N,) descending.
         labels: (N,) integers; boxes of different labels leave each other alone.
-        iou_threshold: overlap from which a score falls.
+        soft: how much is left.
         least: (N,) what must be left of each.
 
     Returns:
@@ -211,8 +212,8 @@ def soften_overlaps(
         kept.append(i)
         alive[i] = False
         rivals = np.flatnonzero(alive & (labels == labels[i]))
-        overlap = iou(boxes_xyxy[[i]], boxes_xyxy[rivals])[0]
-        left[rivals] *= np.where(overlap > iou_threshold, 1 - overlap, 1)
+        overlap, part = (measure(boxes_xyxy[[i]], boxes_xyxy[rivals])[0] for measure in (iou, inside))
+        left[rivals] *= np.minimum(np.exp(-(overlap**2) / soft.sigma), 1 - soft.part_cost * part)
         alive[rivals] = left[rivals] > least[rivals]
     return np.array(kept, dtype=np.intp), left
 

@@ -80,6 +80,15 @@ class ModelCard(BaseModel, frozen=True, extra="forbid", populate_by_name=True):
         raise NotImplementedError
 
 
+class SoftSuppression(BaseModel, frozen=True, extra="forbid"):
+    """How much of its score a box keeps that overlaps a better one of its class: the lesser of two shares."""
+
+    sigma: float = Field(gt=0)
+    """``exp(-IoU^2 / sigma)`` (Bodla et al. 2017, equation 3)."""
+    part_cost: float = Field(default=0.0, ge=0, lt=1)
+    """``1 - part_cost * share``, where the better box covers that share of it."""
+
+
 class YoloxCard(ModelCard, frozen=True):
     """A YOLOX detector with raw grid outputs ``[N, sum(hw/s^2), 5 + C]``, s = 8, 16, 32."""
 
@@ -97,9 +106,9 @@ class YoloxCard(ModelCard, frozen=True):
     sure_scores: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=dict)
     """Class name to the least score at which an object may begin a track; 0.5 where nothing is said."""
     nms_threshold: float = Field(default=0.45, gt=0, le=1)
-    """Overlap with a better box of its class above which a box goes or, with ``soft_nms``, its score falls."""
-    soft_nms: bool = False
-    """Suppress by lowering scores (Bodla et al. 2017): for detectors that are sure of what stands close together."""
+    """Overlap with a better box of its class above which a box goes."""
+    soft_nms: SoftSuppression | None = None
+    """In its place: for detectors that are sure of objects that stand close together."""
     max_detections: int = Field(default=200, gt=0)
     """The best of a frame; how many more there were is said in ``Detections.left_out``."""
 

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import onnx_fixtures
 import pytest
+from pydantic import ValidationError
 
-from labeling.boxes import iou
 from labeling.detection import Detections, Detector, decode_yolox, letterbox, soften_overlaps, suppress_overlaps
 from labeling.errors import ModelError
-from labeling.model_cards import YoloxCard, load_cards
+from labeling.model_cards import SoftSuppression, YoloxCard, load_cards
 
 WIDTH, HEIGHT = 160, 96
 
@@ -154,12 +154,23 @@ def test_suppression_equals_the_plain_double_loop() -> None:
 def test_soft_suppression_keeps_a_confident_neighbour_and_drops_a_double() -> None:
     boxes = np.array([[0, 0, 60, 60], [20, 0, 80, 60], [2, 1, 62, 61], [300, 0, 360, 60], [20, 0, 80, 60]], np.float32)
     scores, labels = np.array([0.9, 0.8, 0.7, 0.6, 0.5], np.float32), np.array([0, 0, 0, 0, 1])
-    keep, left = soften_overlaps(boxes, scores, labels, 0.3, np.full(5, 0.25))
+    soft, least = SoftSuppression(sigma=0.4), np.full(5, 0.25)
+    keep, left = soften_overlaps(boxes, scores, labels, soft, least)
     assert keep.tolist() == [0, 3, 4, 1]
     # A half is shared with the first: 40 of 60 px, so 40 / 80.
-    np.testing.assert_allclose(left[keep], [0.9, 0.6, 0.5, 0.8 * 0.5])
+    np.testing.assert_allclose(left[keep], [0.9, 0.6, 0.5, 0.8 * np.exp(-0.25 / 0.4)], rtol=1e-6)
     assert suppress_overlaps(boxes, labels, 0.45).tolist() == [0, 3, 4]
-    assert soften_overlaps(boxes, scores, labels, 0.6, np.full(5, 0.25))[0].tolist() == [0, 1, 3, 4]
+
+
+def test_a_part_of_a_better_box_costs_what_lies_inside() -> None:
+    boxes = np.array([[0, 0, 100, 100], [60, 50, 90, 100], [90, 50, 120, 100]], np.float32)
+    scores, labels, least = np.array([0.9, 0.6, 0.6], np.float32), np.zeros(3, int), np.full(3, 0.1)
+    soft = SoftSuppression(sigma=0.4, part_cost=0.4)
+    np.testing.assert_allclose(
+        soften_overlaps(boxes, scores, labels, soft, least)[1], [0.9, 0.6 * 0.6, 0.6 * (1 - 0.4 / 3)], rtol=1e-6
+    )
+    plain = SoftSuppression(sigma=0.4)
+    assert soften_overlaps(boxes, scores, labels, plain, least)[1].min() > 0.55
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -175,21 +186,30 @@ def test_soft_suppression_equals_the_plain_loop(seed: int) -> None:
         rest.remove(best)
         plain.append((best, left[best]))
         for other in rest:
-            overlap = float(iou(boxes[[best]], boxes[[other]])[0, 0])
-            if labels[other] == labels[best] and overlap > 0.3:
-                left[other] *= 1 - overlap
+            if labels[other] == labels[best]:
+                corner, end = (
+                    np.maximum(boxes[best, :2], boxes[other, :2]),
+                    np.minimum(boxes[best, 2:], boxes[other, 2:]),
+                )
+                shared = float(np.prod(np.maximum(end - corner, 0)))
+                areas = [float(np.prod(boxes[k, 2:] - boxes[k, :2])) for k in (best, other)]
+                overlap = shared / (sum(areas) - shared)
+                left[other] *= min(np.exp(-(overlap**2) / 0.3), 1 - 0.5 * shared / areas[1])
     wanted = [(index, score) for index, score in plain if score > 0.2]
-    keep, values = soften_overlaps(boxes, scores, labels, 0.3, np.full(60, 0.2))
+    soft = SoftSuppression(sigma=0.3, part_cost=0.5)
+    keep, values = soften_overlaps(boxes, scores, labels, soft, np.full(60, 0.2))
     assert 3 < len(keep) < 60 and keep.tolist() == [index for index, _ in wanted]
     np.testing.assert_allclose(values[keep], [score for _, score in wanted])
 
 
 def test_a_card_may_ask_for_soft_suppression() -> None:
     output = raw_output([(0, 0, 60, 60, 0, 0.9), (20, 0, 80, 60, 0, 0.8), (2, 1, 62, 61, 0, 0.7)])
-    card = toy_card(nms_threshold=0.3, soft_nms=True, score_threshold=0.25)
+    card = toy_card(soft_nms={"sigma": 0.4}, score_threshold=0.25)
     found = decode_yolox(output, card, ratio=1, width=WIDTH, height=HEIGHT)
-    np.testing.assert_allclose(found.scores, [0.9, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(found.scores, [0.9, 0.8 * np.exp(-0.25 / 0.4)], rtol=1e-5)
     assert len(found.of_category("car")) == 2
+    with pytest.raises(ValidationError, match="sigma"):
+        toy_card(soft_nms={"sigma": 0.0})
 
 
 @pytest.mark.parametrize("size", [(96, 160), (540, 960), (960, 540), (1, 1), (3, 4000)], ids=str)
