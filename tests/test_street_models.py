@@ -23,6 +23,7 @@ from training.street_export import export_model, fold_norms
 from training.street_fitting import FitSettings, best_precision, fit, rate_at
 from training.street_losses import detector_loss, field_loss, simcc_loss
 from training.street_models import evaluate
+from training.street_models import main as train_street_models
 from training.street_networks import FieldGraph, FieldNetwork, Sharpening, SimccGraph, SimccNetwork, StreetDetector
 from training.street_plans import plan_streets
 from training.street_pool import PICTURE_SIZE, ObjectTruth, PoolCrop, PoolFrame, StreetPool, render_pool
@@ -421,6 +422,34 @@ def test_the_pool_holds_what_the_street_shows() -> None:
         box = crop.truth.box_xyxy
         middle = (box[:2] + box[2:]) / 2
         np.testing.assert_allclose(middle, (width / 2, height / 2), atol=1)
+
+
+def test_a_training_leaves_weights_and_is_not_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["--only", "street_car24", "--streets", "1", "--share", "0.0003", "--workers", "1", "--train-only"]
+    with pytest.raises(SystemExit):
+        train_street_models(command)
+    assert "--checkpoints" in capsys.readouterr().err
+    command += ["--checkpoints", str(tmp_path / "weights"), "--out", str(tmp_path)]
+    train_street_models(command)
+    assert [path.name for path in (tmp_path / "weights").iterdir()] == ["street_car24.pt"]
+    assert "7 frames" in capsys.readouterr().out
+    train_street_models(command)
+    assert "frames" not in capsys.readouterr().out
+
+
+@pytest.mark.skipif(torch.cuda.device_count() > 0, reason="there is a GPU")
+def test_a_training_on_a_gpu_that_is_not_there_ends_before_it_renders(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="no GPU"):
+        train_street_models(
+            ["--device", "cuda", "--train-only", "--checkpoints", str(tmp_path), "--out", str(tmp_path)]
+        )
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_every_device_has_a_budget_for_every_model(device) -> None:
+    plans = [recipe(name, device=device) for name in MODEL_NAMES]
+    assert all(plan.fit.device == device and plan.fit.steps >= 1000 for plan in plans)
+    assert sum(plan.fit.loaders > 0 for plan in plans) == (len(plans) if device == "cuda" else 0)
 
 
 @pytest.mark.parametrize("name", MODEL_NAMES)

@@ -149,6 +149,9 @@ def train_all(options: argparse.Namespace) -> None:
     ]
     missing = [job for job in jobs if not job.is_finished]
     if missing:
+        # Counted without opening the GPU, which forked processes could not use then.
+        if options.device == "cuda" and not torch.cuda.device_count():
+            raise SystemExit("--device cuda: torch sees no GPU; leave it out, or name finished --checkpoints")
         start = time.perf_counter()
         plans = plan_lessons(TRAIN_SEED, options.streets or budget.streets, frames=7, every=15)
         pool = render_pool(plans, workers=options.workers)

@@ -52,7 +52,7 @@ _FIELD_DECODING: dict[str, dict[str, float]] = {
     "lane24": {"point_threshold": 0.3, "instance_threshold": 0.28, "min_points": 4},
 }
 _LICENCE = "Apache-2.0"
-_SOURCE = "ships with Animatic; `make street-models` trains and exports it again from seeds"
+_SOURCE = "ships with Animatic; `make street-models DEVICE=cuda` trains and exports it again from seeds"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
