@@ -36,6 +36,8 @@ class EffortSettings:
     quiet_frames: int = 24
     """A network that has seen nothing for so long looks only every ``quiet_gap`` frames."""
     quiet_gap: int = 12
+    sure_share: float = 1.0
+    """Of the detector's sure scores, at which a track may begin: who looks rarely must believe sooner."""
     sure_looks: int = 2
     """Looks that must be sure of an object for it to be believed; where they are rare, one must do."""
 
@@ -51,6 +53,7 @@ EFFORTS: dict[Effort, EffortSettings] = {
         flow_step=5,
         max_bend=0.05,
         max_miss=0.08,
+        sure_share=0.6,
         sure_looks=1,
     ),
 }

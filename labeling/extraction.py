@@ -90,7 +90,7 @@ def label_with(
     labels = _renumbered([channel.labels for channel in channels])
     fresh = frozenset(moment for moment, number in enumerate(moments) if number in breaks)
     labels = _on_grid(without_doubles(smooth_tracks(labels, breaks=fresh)), shown, first_frame=first_frame)
-    sure_scores = {category: score for channel in channels for category, score in channel.look.sure_scores.items()}
+    sure_scores = {category: score for channel in channels for category, score in channel.sure_scores.items()}
     return drop_passing_tracks(
         labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES, sure_looks=settings.sure_looks, sure_scores=sure_scores
     )
@@ -164,7 +164,8 @@ class _Channel:
         self.look, self.settings = look, settings
         self.labels: list[Keypoints] = []
         self.looks = 0
-        self._tracker = RunTracker(sure_scores=look.sure_scores)
+        self.sure_scores = {category: settings.sure_share * score for category, score in look.sure_scores.items()}
+        self._tracker = RunTracker(sure_scores=self.sure_scores)
         self._forget()
 
     def _forget(self) -> None:
