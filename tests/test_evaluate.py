@@ -108,8 +108,12 @@ def figures(evaluation: Evaluation, name: str) -> dict[str, float]:
 def test_perfect_samples_score_at_the_noise_floor_and_a_held_frame_worse(perfect: Evaluation) -> None:
     ours, floor, held = (figures(perfect, name) for name in (SAMPLES, FLOOR, HELD))
     assert ours["min_ade_m"] < 0.1 and floor["min_ade_m"] < 0.1 and held["min_ade_m"] > 1
-    for name in ("min_ade_m", "box_iou", "truth_pck", "motion_pck", "skeleton_pck", "psnr_db", "ssim"):
+    for name in ("min_ade_m", "box_iou", "truth_pck", "psnr_db", "ssim"):
         assert ours[name] == pytest.approx(floor[name], abs=0.01), "both are the truth, encoded again"
+    for name in ("motion_pck", "skeleton_pck"):
+        # One skeleton was coded, the other is drawn anew: of 300 points read back from a pile of cars at 192x128, the
+        # few of one car more or less.
+        assert ours[name] == pytest.approx(floor[name], abs=0.02), "both are the truth's skeletons, read back"
     for name in ("box_iou", "truth_pck", "psnr_db", "ssim"):
         assert held[name] < ours[name]
     assert ours["psnr_db"] > 30 and ours["ssim"] > 0.9
