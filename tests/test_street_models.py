@@ -273,10 +273,12 @@ def test_a_finished_training_is_read_and_not_repeated(tmp_path: Path) -> None:
         fit(torch.nn.Linear(3, 1), never, loss, replace(settings, steps=8), checkpoint=tmp_path / "state.pt")
 
 
-def test_processors_without_bfloat16_use_float32() -> None:
+@pytest.mark.parametrize(("native", "wanted"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_processors_without_bfloat16_use_float32(native, wanted, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: native)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
+    assert best_precision(torch.device("cpu")) == wanted
     assert best_precision(torch.device("cuda")) == torch.bfloat16
-    native = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
-    assert (best_precision(torch.device("cpu")) == torch.bfloat16) == native
 
 
 def test_points_in_doubt_score_lower_when_hidden_ones_weigh_more() -> None:

@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from labeling.boxes import inside, iou
 from labeling.detection import Detections, Detector
 from labeling.fields import FieldModel
 from labeling.keypoints import KeypointHead
@@ -109,35 +110,32 @@ def match_boxes(boxes_xyxy: np.ndarray, truths: Sequence[BoxTruth]) -> tuple[np.
     phantoms = []
     boxes = np.array([truth.box_xyxy for truth in truths]).reshape(-1, 4)
     for index, box in enumerate(boxes_xyxy):
-        overlap, inside = box_overlaps(box, boxes)
+        overlap, covered = box_overlaps(box, boxes)
         overlap[partner >= 0] = 0
         best = int(overlap.argmax()) if len(overlap) else -1
         if best >= 0 and overlap[best] >= _MATCH_IOU:
             partner[best] = index
-        elif not is_excused(box, truths, inside):
+        elif not is_excused(box, truths, covered):
             phantoms.append(index)
     return partner, np.array(phantoms, np.int64)
 
 
-def is_excused(box_xyxy: np.ndarray, truths: Sequence[BoxTruth], inside: np.ndarray) -> bool:
+def is_excused(box_xyxy: np.ndarray, truths: Sequence[BoxTruth], covered: np.ndarray) -> bool:
     """Whether a box that matches nothing is no mistake: too low, or on an object that is not judged.
 
     Args:
         box_xyxy: (4,).
         truths: n objects.
-        inside: (n,) share of the box that each covers.
+        covered: (n,) share of the box that each covers.
     """
     if box_xyxy[3] - box_xyxy[1] < JUDGED_HEIGHT_PX:
         return True
-    return any(not is_judged(truth) and share > _EXCUSED_SHARE for truth, share in zip(truths, inside, strict=True))
+    return any(not is_judged(truth) and share > _EXCUSED_SHARE for truth, share in zip(truths, covered, strict=True))
 
 
 def box_overlaps(box: np.ndarray, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n,) IoU of a box (4,) with boxes (n, 4), and (n,) share of it that each covers."""
-    sides = np.minimum(boxes[:, 2:], box[2:]) - np.maximum(boxes[:, :2], box[:2])
-    shared = np.prod(np.maximum(sides, 0), axis=1)
-    area, areas = np.prod(box[2:] - box[:2]), np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
-    return shared / np.maximum(area + areas - shared, 1e-6), shared / max(float(area), 1e-6)
+    return iou(box[None], boxes)[0], inside(boxes, box[None])[:, 0]
 
 
 def _judge_points(

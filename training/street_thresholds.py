@@ -55,7 +55,9 @@ def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFram
             seen = found.select(found.classes == name)
             mine = [truth for truth in truths if truth.category == card.categories[name]]
             exact[name].append([sum(judge_count(seen, mine, threshold)) == 0 for threshold in BOX_SCORES])
-            phantoms[name].append([judge_count(seen, mine, threshold)[1] for threshold in SURE_SCORES])
+            # Matches are made best first: those above a score are the first of all.
+            _, extra = match_boxes(seen.boxes_xyxy, mine)
+            phantoms[name].append([int((seen.scores[extra] > threshold).sum()) for threshold in SURE_SCORES])
     best = {name: best_threshold(np.mean(rows, axis=0), BOX_SCORES) for name, rows in exact.items()}
     sure = {
         name: max(best[name], sure_threshold(np.mean(rows, axis=0), SURE_SCORES)) for name, rows in phantoms.items()
