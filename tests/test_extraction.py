@@ -57,6 +57,15 @@ def test_the_last_frame_is_looked_at() -> None:
     assert scene.seen[-1] == 37
 
 
+@pytest.mark.parametrize(("effort", "sure", "shown"), [("fast", 0.91, 40), ("exact", 0.91, 0), ("fast", 1.6, 0)])
+def test_who_looks_rarely_believes_sooner(effort: Effort, sure: float, shown: int) -> None:
+    """The scene's card scores 0.9, which is 0.6 of 1.5."""
+    scene = MovingCard()
+    scene.sure_scores = {"car": sure}
+    labels = label_with([scene], (scene.render(t) for t in range(40)), first_frame=0, effort=effort)
+    assert len(labels) == shown
+
+
 class ShownInOrder(MovingCard):
     """A card whose frames are shown in some order; it is told the number of the frame that it sees."""
 
