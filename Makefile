@@ -6,8 +6,6 @@ READY := $(VENV)/.ready
 TEST_WORKERS ?= 2
 # What street-models trains on: cpu, or cuda with many cores beside it.
 DEVICE ?= cpu
-# Anything: the detector is trained a second time, for more than an hour on two cores.
-REFINE ?=
 
 .PHONY: setup demo test lint check street-models benchmarks clean
 
@@ -34,7 +32,7 @@ lint: $(READY)
 check: test lint
 
 street-models: $(READY)
-	$(BIN)/python -m training.street_models --device $(DEVICE) $(if $(REFINE),--refine)
+	$(BIN)/python -m training.street_models --device $(DEVICE)
 
 clean:
 	rm -rf demo .pytest_cache .ruff_cache

@@ -15,8 +15,13 @@ def inside(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
 
 
 def _shared(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
-    corner = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
-    return np.clip(np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:]) - corner, 0, None).prod(axis=2)
+    # Side by side and not as (N, M, 2): reducing an axis of two takes longer than all the rest.
+    width, height = (
+        np.minimum(boxes_a[:, None, axis + 2], boxes_b[None, :, axis + 2])
+        - np.maximum(boxes_a[:, None, axis], boxes_b[None, :, axis])
+        for axis in (0, 1)
+    )
+    return np.maximum(width, 0) * np.maximum(height, 0)
 
 
 def _areas(boxes: np.ndarray) -> np.ndarray:

@@ -100,19 +100,25 @@ class Detector:
         """
         if not len(frames):
             return []
-        pictures = [letterbox(frame, self.card) for frame in frames]
-        (outputs,) = self.model.run(np.stack([picture for picture, _ in pictures]))
+        batch = np.empty((len(frames), 3, self.card.input_height, self.card.input_width), np.float32)
+        ratios = [letterbox(frame, self.card, out=planes)[1] for frame, planes in zip(frames, batch, strict=True)]
+        (outputs,) = self.model.run(batch)
         found = []
-        for output, frame, (_, ratio) in zip(outputs, frames, pictures, strict=True):
+        for output, frame, ratio in zip(outputs, frames, ratios, strict=True):
             found.append(decode_yolox(output, self.card, ratio=ratio, width=frame.shape[1], height=frame.shape[0]))
             self.left_out += found[-1].left_out
         return found
 
 
-def letterbox(frame: np.ndarray, card: YoloxCard) -> tuple[np.ndarray, float]:
+def letterbox(frame: np.ndarray, card: YoloxCard, *, out: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """The network's input for one frame, and its scale relative to the frame.
 
     The frame is scaled to fit (linear), put at the top left, and padded with grey 114.
+
+    Args:
+        frame: (H, W, 3) uint8 RGB.
+        card: size, channel order and normalisation.
+        out: where the input goes; a new array by default.
 
     Returns:
         (3, input_height, input_width) float32 in the card's channel order and normalisation, and the scale.
@@ -126,7 +132,7 @@ def letterbox(frame: np.ndarray, card: YoloxCard) -> tuple[np.ndarray, float]:
     inner = (max(1, int(width * ratio)), max(1, int(height * ratio)))
     canvas = np.full((card.input_height, card.input_width, 3), LETTERBOX_GREY, np.uint8)
     canvas[: inner[1], : inner[0]] = cv2.resize(frame, inner, interpolation=cv2.INTER_LINEAR)
-    return network_input(canvas, card), ratio
+    return network_input(canvas, card, out=out), ratio
 
 
 def decode_yolox(output: np.ndarray, card: YoloxCard, *, ratio: float, width: int, height: int) -> Detections:
@@ -205,17 +211,20 @@ def soften_overlaps(
     Returns:
         Indices of the boxes that stay, best first by what is left, and (N,) what is left of all scores.
     """
-    left, alive = scores.copy(), np.ones(len(scores), bool)
-    kept = []
-    while alive.any():
-        i = int(np.where(alive, left, -1).argmax())
-        kept.append(i)
-        alive[i] = False
-        rivals = np.flatnonzero(alive & (labels == labels[i]))
-        overlap, part = (measure(boxes_xyxy[[i]], boxes_xyxy[rivals])[0] for measure in (iou, inside))
-        left[rivals] *= np.minimum(np.exp(-(overlap**2) / soft.sigma), 1 - soft.part_cost * part)
-        alive[rivals] = left[rivals] > least[rivals]
-    return np.array(kept, dtype=np.intp), left
+    left, kept = scores.copy(), []
+    for label in np.unique(labels):
+        mine = np.flatnonzero(labels == label)
+        boxes, rest, limits, alive = boxes_xyxy[mine], left[mine], least[mine], np.ones(len(mine), bool)
+        share = np.minimum(np.exp(-(iou(boxes, boxes) ** 2) / soft.sigma), 1 - soft.part_cost * inside(boxes, boxes))
+        while alive.any():
+            best = int(np.where(alive, rest, -1).argmax())
+            kept.append(mine[best])
+            alive[best] = False
+            rest[alive] *= share[best, alive]
+            alive &= rest > limits
+        left[mine] = rest
+    found = np.array(kept, dtype=np.intp)
+    return found[np.lexsort((found, -left[found]))], left
 
 
 def _decode_boxes(raw: np.ndarray, rows: np.ndarray, card: YoloxCard) -> np.ndarray:

@@ -123,9 +123,11 @@ class FieldModel:
         outputs = [2 * n + side for n in wanted for side in (0, 1)]
         found: list[list[Keypoints]] = []
         for start in range(0, len(frames), self.model.max_batch):
-            pictures = [padded_input(frame, self.card) for frame in frames[start : start + self.model.max_batch]]
-            fields = self.model.run(np.stack([picture for picture, _ in pictures]), outputs=outputs)
-            for i, (_, ratio) in enumerate(pictures):
+            chunk = frames[start : start + self.model.max_batch]
+            batch = np.empty((len(chunk), 3, self.card.input_height, self.card.input_width), np.float32)
+            ratios = [padded_input(frame, self.card, out=planes)[1] for frame, planes in zip(chunk, batch, strict=True)]
+            fields = self.model.run(batch, outputs=outputs)
+            for i, ratio in enumerate(ratios):
                 pairs = {n: (fields[2 * k][i], fields[2 * k + 1][i]) for k, n in enumerate(wanted)}
                 found.append(self._objects(pairs, ratio=ratio, frame=first_frame + start + i))
         return found
@@ -145,11 +147,16 @@ class FieldModel:
         return objects
 
 
-def padded_input(frame: np.ndarray, card: CifcafCard) -> tuple[np.ndarray, float]:
+def padded_input(frame: np.ndarray, card: CifcafCard, *, out: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """The network's input for one frame, and its scale relative to the frame.
 
     The frame is scaled to fit into the input less its one extra row and column, put at the top left, and padded with
     the mean colour, right and bottom.
+
+    Args:
+        frame: (H, W, 3) uint8 RGB.
+        card: size and normalisation.
+        out: where the input goes; a new array by default.
 
     Returns:
         (3, input_height, input_width) float32, and the scale.
@@ -162,8 +169,10 @@ def padded_input(frame: np.ndarray, card: CifcafCard) -> tuple[np.ndarray, float
     if ratio != 1:
         size = (max(1, round(frame.shape[1] * ratio)), max(1, round(frame.shape[0] * ratio)))
         frame = cv2.resize(frame, size, interpolation=cv2.INTER_AREA if ratio < 1 else cv2.INTER_LINEAR)
-    planes = np.zeros((3, card.input_height, card.input_width), np.float32)
-    planes[:, : frame.shape[0], : frame.shape[1]] = network_input(frame, card)
+    height, width = frame.shape[:2]
+    planes = np.empty((3, card.input_height, card.input_width), np.float32) if out is None else out
+    network_input(frame, card, out=planes[:, :height, :width])
+    planes[:, height:], planes[:, :height, width:] = 0, 0
     return planes, ratio
 
 

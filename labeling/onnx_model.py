@@ -93,7 +93,7 @@ class OnnxModel:
         if not parts:
             shapes = list(self.card.output_shapes().values())
             return [np.zeros((0, *(size or 0 for size in shapes[i][1:])), np.float32) for i in chosen]
-        return [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return parts[0] if len(parts) == 1 else [np.concatenate(column) for column in zip(*parts, strict=True)]
 
     def _chunks(self, batch: np.ndarray) -> Iterator[np.ndarray]:
         size = self._graph.batch or self.max_batch
@@ -147,13 +147,13 @@ def check_frame(frame: np.ndarray) -> None:
         raise ModelError(f"a frame must be (H, W, 3) uint8 RGB, got {frame.dtype} {frame.shape}; decode it first")
 
 
-def network_input(picture: np.ndarray, card: ModelCard) -> np.ndarray:
-    """(H, W, 3) uint8 RGB to (3, H, W) float32 in the card's channel order and normalisation."""
-    planes = np.empty((3, *picture.shape[:2]), np.float32)
+def network_input(picture: np.ndarray, card: ModelCard, *, out: np.ndarray | None = None) -> np.ndarray:
+    """(H, W, 3) uint8 RGB to (3, H, W) float32 in the card's channel order and normalisation; into ``out`` if given."""
+    planes = np.empty((3, *picture.shape[:2]), np.float32) if out is None else out
     channels = cv2.split(picture)
     order = channels[::-1] if card.channel_order == "bgr" else channels
     for i, levels in enumerate(_levels(card.mean, card.std)):
-        planes[i] = cv2.LUT(order[i], levels)
+        cv2.LUT(order[i], levels, planes[i])
     return planes
 
 

@@ -18,24 +18,16 @@ from labeling.model_cards import SHIPPED_CARDS, FieldHeadCard, SimccCard, YoloxC
 from labeling.onnx_model import OnnxModel
 from labeling.schemas import keypoint_schema
 from training.street_augment import AugmentSettings, disturb, map_points, random_map
-from training.street_batches import (
-    Batch,
-    CropBatches,
-    DetectorBatches,
-    FieldBatches,
-    behind_board,
-    mirror_order,
-    to_input,
-)
+from training.street_batches import Batch, CropBatches, FieldBatches, behind_board, mirror_order, to_input
 from training.street_export import export_model, fold_norms
-from training.street_fitting import FitSettings, best_precision, fit, load_finished, rate_at
+from training.street_fitting import FitSettings, best_precision, fit, rate_at
 from training.street_losses import detector_loss, field_loss, simcc_loss
 from training.street_models import evaluate
 from training.street_models import main as train_street_models
 from training.street_networks import FieldGraph, FieldNetwork, Sharpening, SimccGraph, SimccNetwork, StreetDetector
 from training.street_plans import plan_streets
 from training.street_pool import PICTURE_SIZE, ObjectTruth, PoolCrop, PoolFrame, StreetPool, render_pool
-from training.street_recipes import BUDGETS, MODEL_NAMES, REFINEMENT, recipe, refinement
+from training.street_recipes import MODEL_NAMES, recipe
 from training.street_scores import distance_to_curve
 from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses, grid_cells
 
@@ -445,65 +437,6 @@ def test_a_training_leaves_weights_and_is_not_repeated(tmp_path: Path, capsys: p
     assert "7 frames" in capsys.readouterr().out
     train_street_models(command)
     assert "frames" not in capsys.readouterr().out
-
-
-def test_a_refinement_sets_out_from_what_was_learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    weights = tmp_path / "weights"
-    command = ["--only", "street_detector", "--streets", "1", "--share", "0.0001", "--workers", "1", "--train-only"]
-    command += ["--checkpoints", str(weights), "--out", str(tmp_path)]
-    train_street_models(command)
-    first = torch.load(weights / "street_detector.pt", weights_only=True)["average"]
-    train_street_models([*command, "--refine"])
-    assert capsys.readouterr().out.count("7 frames") == 2
-    for seed in REFINEMENT.seeds:
-        refined = torch.load(weights / f"street_detector_refined_{seed}.pt", weights_only=True)["average"]
-        moved = {name for name in first if not torch.equal(first[name], refined[name])}
-        assert moved and not any("running" in name for name in moved)
-        # One step at a twentieth of the rate: from any other start it would be far away.
-        assert all(float((first[name] - refined[name]).abs().max()) < 1e-3 for name in moved)
-
-
-def test_refinement_is_of_streets_that_no_budget_has() -> None:
-    assert all(REFINEMENT.first_street >= budget.streets for budget in BUDGETS.values())
-    plan = refinement(REFINEMENT.seeds[0])
-    assert not plan.fit.norms_learn and plan.fit.device == "cpu" and plan.card.name == REFINEMENT.model
-
-
-def test_finished_trainings_are_averaged(tmp_path: Path) -> None:
-    paths = [tmp_path / "a.pt", tmp_path / "b.pt"]
-    for path, value in zip(paths, (1.0, 4.0), strict=True):
-        network = torch.nn.BatchNorm1d(2)
-        torch.nn.init.constant_(network.weight, value)
-        torch.save({"finished": 1, "average": network.state_dict()}, path)
-    mean = load_finished(torch.nn.BatchNorm1d(2), *paths)
-    assert mean.weight.tolist() == [2.5, 2.5] and not mean.training
-    assert load_finished(torch.nn.BatchNorm1d(2), paths[1]).weight.tolist() == [4, 4]
-
-
-def test_windows_are_laid_around_parts_as_often_as_asked() -> None:
-    boxes = {0.4: (100.0, 100.0, 120.0, 140.0), 1.0: (600.0, 100.0, 660.0, 140.0)}
-    things = tuple(
-        ObjectTruth(
-            category="car", box_xyxy=np.array(box, np.float32), points_xy=np.zeros((24, 2), np.float32),
-            visible=np.ones(24, bool), visible_share=share,
-        )
-        for share, box in boxes.items()
-    )  # fmt: skip
-    frame = PoolFrame(picture=np.zeros((512, 768, 3), np.uint8), scale=1.0, objects=things)
-    pool = StreetPool(frames=(frame,), crops={})
-
-    def share_of_parts(part_draw: float) -> float:
-        batches = DetectorBatches(
-            pool=pool, sizes=((160, 128, 200),), augment=AugmentSettings(), person_share=0.0, part_draw=part_draw
-        )
-        classes, found, _ = batches(np.random.default_rng(0)).targets
-        # The part is high, the whole car wide, and no window has room for both.
-        high = found[..., 3] - found[..., 1] > found[..., 2] - found[..., 0]
-        parts, wholes = (int(((classes >= 0) & shown).any(dim=1).sum()) for shown in (high, ~high))
-        return parts / (parts + wholes)
-
-    assert 0.35 < share_of_parts(1.0) < 0.65
-    assert share_of_parts(9.0) > 0.8
 
 
 @pytest.mark.skipif(torch.cuda.device_count() > 0, reason="there is a GPU")

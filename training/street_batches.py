@@ -23,8 +23,6 @@ LEAST_SHARE = 0.15
 """Objects of which less is visible are left out of the detector's loss: neither asked for nor forbidden."""
 _LEAST_WINDOW_PX = 9.0
 """Lower objects are left out of the detector's loss too: of all objects a tenth, and of no use."""
-_WHOLE_SHARE = 0.8
-"""Visible share from which an object is no longer drawn as a part."""
 _HIDDEN_WEIGHT = 0.25
 _MEAN_COLOUR = tuple(float(round(value)) for value in IMAGENET_MEAN)
 _BOX_SLACK_PX = 2.0
@@ -86,8 +84,6 @@ class DetectorBatches:
     scales: tuple[float, float] = (0.85, 1.2)
     person_share: float = 0.5
     """Of windows around a person: they are small and rare."""
-    part_draw: float = 1.0
-    """Times as often a window is laid around an object that is partly hidden."""
 
     def __call__(self, rng: np.random.Generator) -> Batch:
         """One batch: targets are classes (N, A), boxes (N, A, 4) and weights (N, A)."""
@@ -115,13 +111,11 @@ class DetectorBatches:
 
     def _focus(self, frame: PoolFrame, rng: np.random.Generator, category: Category) -> np.ndarray | None:
         """The middle of one object, picture pixels; one window in four lies anywhere."""
-        found = [truth for truth in frame.objects if truth.category == category and truth.visible_share > 0.2]
-        if not found or rng.random() < 0.25:
+        boxes = [truth.box_xyxy for truth in frame.objects if truth.category == category and truth.visible_share > 0.2]
+        if not boxes or rng.random() < 0.25:
             return None
-        boxes = np.stack([truth.box_xyxy for truth in found])
         # Near objects are few, near people fewest: a crowd on the pavement would leave them no window.
-        weights = (boxes[:, 3] - boxes[:, 1]) ** (1.0 if category == "person" else 0.5)
-        weights *= [self.part_draw if truth.visible_share < _WHOLE_SHARE else 1.0 for truth in found]
+        weights = np.array([box[3] - box[1] for box in boxes]) ** (1.0 if category == "person" else 0.5)
         box = boxes[int(rng.choice(len(boxes), p=weights / weights.sum()))]
         return (box[:2] + box[2:]) / 2 * frame.scale
 

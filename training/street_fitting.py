@@ -36,9 +36,6 @@ class FitSettings:
     precision: torch.dtype | None = None
     """Of convolutions and products; weights and losses stay float32. None: bfloat16 where the device multiplies it
     faster (``best_precision``)."""
-    norms_learn: bool = True
-    """Whether batch norms follow the batches that come. Those of a network that has learnt from larger ones had better
-    stay as they are."""
     channels_last: bool = True
     """Lay pictures out pixel by pixel, which 2-D convolutions are faster on; networks over videos cannot."""
     device: str = "cpu"
@@ -60,7 +57,7 @@ def fit(
     """Train ``network`` in place; the moving average of its weights is returned, on the CPU, ready for inference.
 
     Args:
-        network: initialised by the caller, under ``torch.manual_seed``, or trained before.
+        network: initialised by the caller, under ``torch.manual_seed``.
         make_batch: gives one batch for a generator that is seeded by ``(seed, step)``, so that batches do not depend on
             threads or processes.
         loss_of: scalar loss of a network and a batch.
@@ -74,10 +71,6 @@ def fit(
     if checkpoint and is_finished(checkpoint, settings.steps):
         return load_finished(network, checkpoint)
     network.train().to(settings.device)
-    if not settings.norms_learn:
-        for module in network.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.eval()
     if settings.channels_last:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network)
@@ -124,16 +117,10 @@ def is_finished(checkpoint: Path, steps: int) -> bool:
     return checkpoint.is_file() and torch.load(checkpoint, weights_only=True, mmap=True).get("finished") == steps
 
 
-def load_finished(network: nn.Module, *checkpoints: Path) -> nn.Module:
-    """The network with the weights that its training ended with, or with the mean of several trainings' that set out
-    from the same weights (Wortsman et al. 2022, model soups)."""
-    ends = [torch.load(checkpoint, weights_only=True)["average"] for checkpoint in checkpoints]
-    network.load_state_dict({name: _mean([end[name] for end in ends]) for name in ends[0]})
+def load_finished(network: nn.Module, checkpoint: Path) -> nn.Module:
+    """The network with the weights that its training ended with."""
+    network.load_state_dict(torch.load(checkpoint, weights_only=True)["average"])
     return network.eval()
-
-
-def _mean(values: list[torch.Tensor]) -> torch.Tensor:
-    return torch.stack(values).mean(dim=0) if values[0].dtype.is_floating_point else values[0]
 
 
 def rate_at(step: int, steps: int) -> float:

@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import get_args
@@ -33,7 +33,7 @@ from training.street_export import export_model
 from training.street_fitting import fit, is_finished, load_finished
 from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, judging_frames, plan_lessons
 from training.street_pool import StreetPool, render_pool
-from training.street_recipes import BUDGETS, MODEL_NAMES, REFINEMENT, Device, ModelName, Recipe, recipe, refinement
+from training.street_recipes import BUDGETS, MODEL_NAMES, Device, ModelName, Recipe, recipe
 from training.street_scores import StreetModels, Tally, judge_frame
 from training.street_thresholds import choose_thresholds
 
@@ -53,24 +53,14 @@ class _Job:
     seed: int
     share: float
     checkpoints: Path
-    refines: bool = False
-    """Whether it sets out from where the model's first training ended."""
 
     @property
     def plan(self) -> Recipe:
-        if self.refines:
-            return refinement(self.seed, share=self.share)
         return recipe(self.name, device=self.device, seed=self.seed, share=self.share)
 
     @property
-    def origin(self) -> Path:
-        """Where the model's first training ends."""
-        return self.checkpoints / f"{self.name}.pt"
-
-    @property
     def checkpoint(self) -> Path:
-        """Where this training ends."""
-        return self.checkpoints / f"{self.name}_refined_{self.seed}.pt" if self.refines else self.origin
+        return self.checkpoints / f"{self.name}.pt"
 
     @property
     def is_finished(self) -> bool:
@@ -96,10 +86,7 @@ def _train(job: _Job) -> tuple[str, float]:
     start = time.perf_counter()
     plan = job.plan
     torch.manual_seed(plan.fit.seed)
-    network = plan.network()
-    if job.refines and not job.checkpoint.is_file():
-        load_finished(network, job.origin)
-    fit(network, plan.batches(_shared_pool[0]), plan.loss, plan.fit, checkpoint=job.checkpoint)
+    fit(plan.network(), plan.batches(_shared_pool[0]), plan.loss, plan.fit, checkpoint=job.checkpoint)
     return job.name, time.perf_counter() - start
 
 
@@ -161,48 +148,28 @@ def write_figures(folder: Path, figures: dict[str, float], *, frames: int) -> No
 def train_all(options: argparse.Namespace) -> None:
     """Train those models that ``--only`` names and no checkpoint holds."""
     budget = BUDGETS[options.device]
-    first = _Job(
-        name=options.only[0], device=options.device, seed=options.seed, share=options.share,
-        checkpoints=options.checkpoints,
-    )  # fmt: skip
-    jobs = [replace(first, name=name) for name in options.only]
+    jobs = [
+        _Job(name=name, device=options.device, seed=options.seed, share=options.share, checkpoints=options.checkpoints)
+        for name in options.only
+    ]
     missing = [job for job in jobs if not job.is_finished]
-    # Counted without opening the GPU, which forked processes could not use then.
-    if missing and options.device == "cuda" and not torch.cuda.device_count():
-        raise SystemExit("--device cuda: torch sees no GPU; leave it out, or name finished --checkpoints")
-    _train_missing(missing, options, first_street=0, streets=options.streets or budget.streets, at_once=budget.jobs)
-    ends = {job.name: [job.checkpoint] for job in jobs}
-    if options.refine and REFINEMENT.model in options.only:
-        refining = [
-            replace(first, name=REFINEMENT.model, device="cpu", seed=seed, refines=True) for seed in REFINEMENT.seeds
-        ]
-        missing = [job for job in refining if not job.is_finished]
-        _train_missing(
-            missing, options, first_street=REFINEMENT.first_street, streets=options.streets or REFINEMENT.streets,
-            at_once=len(refining),
-        )  # fmt: skip
-        ends[REFINEMENT.model] = [job.checkpoint for job in refining]
+    if missing:
+        # Counted without opening the GPU, which forked processes could not use then.
+        if options.device == "cuda" and not torch.cuda.device_count():
+            raise SystemExit("--device cuda: torch sees no GPU; leave it out, or name finished --checkpoints")
+        start = time.perf_counter()
+        plans = plan_lessons(TRAIN_SEED, options.streets or budget.streets, frames=7, every=15)
+        pool = render_pool(plans, workers=options.workers)
+        counts = {name: len(found) for name, found in pool.crops.items()}
+        print(f"{len(pool.frames)} frames, crops {counts}, {time.perf_counter() - start:.0f} s", flush=True)
+        _train_models(missing, pool, at_once=budget.jobs)
     if options.train_only:
         return
     for job in jobs:
         plan = job.plan
-        export_model(plan.graph(load_finished(plan.network(), *ends[job.name])), plan.card, options.out)
+        export_model(plan.graph(load_finished(plan.network(), job.checkpoint)), plan.card, options.out)
     frames = list(judging_frames(VALIDATION_SEED, options.judged_streets, JUDGED_FRAMES))
     choose_thresholds(options.out, options.only, frames)
-
-
-def _train_missing(
-    jobs: Sequence[_Job], options: argparse.Namespace, *, first_street: int, streets: int, at_once: int
-) -> None:
-    """Render the streets that they learn from, and train them."""
-    if not jobs:
-        return
-    start = time.perf_counter()
-    plans = plan_lessons(TRAIN_SEED, first_street + streets, frames=7, every=15)[first_street:]
-    pool = render_pool(plans, workers=options.workers)
-    counts = {name: len(found) for name, found in pool.crops.items()}
-    print(f"{len(pool.frames)} frames, crops {counts}, {time.perf_counter() - start:.0f} s", flush=True)
-    _train_models(jobs, pool, at_once=at_once)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -212,7 +179,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--device", choices=get_args(Device), default="cpu", help="which also says how much is learnt")
     parser.add_argument("--evaluate", action="store_true", help="judge what is there, train nothing")
     parser.add_argument("--train-only", action="store_true", help="end with the weights in --checkpoints")
-    parser.add_argument("--refine", action="store_true", help="train the detector a second time, on two cores")
     parser.add_argument("--out", type=Path, default=SHIPPED_CARDS)
     parser.add_argument("--checkpoints", type=Path, help="folder of weights, from which a stopped run goes on")
     parser.add_argument("--results", type=Path, help="JSON file for the figures and the time")

@@ -52,7 +52,7 @@ _FIELD_DECODING: dict[str, dict[str, float]] = {
     "lane24": {"point_threshold": 0.3, "instance_threshold": 0.28, "min_points": 4},
 }
 _LICENCE = "Apache-2.0"
-_SOURCE = "ships with Animatic; `make street-models DEVICE=cuda REFINE=1` trains and exports it again from seeds"
+_SOURCE = "ships with Animatic; `make street-models DEVICE=cuda` trains and exports it again from seeds"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,31 +83,6 @@ BUDGETS: dict[Device, Budget] = {
     ),
 }  # fmt: skip
 """Two cores in under an hour; one GPU with sixteen cores in under ten minutes, from which the shipped models come."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Refinement:
-    """A second training of a model that has learnt already: gentler, on processors, on other streets."""
-
-    model: ModelName
-    first_street: int
-    """Behind those of every budget."""
-    streets: int
-    seeds: tuple[int, ...]
-    """Of trainings side by side, of which the mean is taken."""
-    steps: int
-    learning_rate: float
-    augment: AugmentSettings
-    part_draw: float
-    """Of ``DetectorBatches``."""
-
-
-REFINEMENT = Refinement(
-    model="street_detector", first_street=max(budget.streets for budget in BUDGETS.values()), streets=800,
-    seeds=(1, 2), steps=9000, learning_rate=5e-4, part_draw=3.0,
-    augment=AugmentSettings(dusk=0.1, night=0.07, blur=0.1, weather=0.1, noise=0.25, compression=0.15),
-)  # fmt: skip
-"""Of the detector, the model whose errors cost most: what is partly hidden more often, bad light less often."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,18 +118,7 @@ def recipe(name: ModelName, *, device: Device = "cpu", seed: int = 1, share: flo
     return _head_recipe(name.removeprefix("street_"), settings, budget.enlarge)
 
 
-def refinement(seed: int, *, share: float = 1.0) -> Recipe:
-    """The recipe of one of ``REFINEMENT``'s trainings, which sets out from weights that ``recipe``'s ended with."""
-    settings = FitSettings(
-        name=REFINEMENT.model, seed=seed, steps=max(1, round(REFINEMENT.steps * share)), norms_learn=False,
-        learning_rate=REFINEMENT.learning_rate,
-    )  # fmt: skip
-    return _detector_recipe(settings, 1, augment=REFINEMENT.augment, part_draw=REFINEMENT.part_draw)
-
-
-def _detector_recipe(
-    settings: FitSettings, enlarge: int, *, augment: AugmentSettings = AugmentSettings(), part_draw: float = 1.0
-) -> Recipe:
+def _detector_recipe(settings: FitSettings, enlarge: int) -> Recipe:
     grids = {(width, height): [torch.from_numpy(array) for array in grid_cells(width, height)]
              for width, height, _ in _WINDOWS}  # fmt: skip
     sizes = tuple((width, height, count * enlarge) for width, height, count in _WINDOWS)
@@ -173,7 +137,7 @@ def _detector_recipe(
     )  # fmt: skip
     return Recipe(
         card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph, loss=loss, fit=settings,
-        batches=lambda pool: DetectorBatches(pool=pool, sizes=sizes, augment=augment, part_draw=part_draw),
+        batches=lambda pool: DetectorBatches(pool=pool, sizes=sizes, augment=AugmentSettings()),
     )  # fmt: skip
 
 
