@@ -127,20 +127,20 @@ def interpolate_gap(start: Keypoints, end: Keypoints) -> list[Keypoints]:
     """The labels between two labels of one object, on straight lines; points that only one knows are absent."""
     gap = end.frame - start.frame
     both = start.present & end.present
-    out = []
-    for step in range(1, gap):
-        share = np.float32(step / gap)
-        points = ((1 - share) * start.points + share * end.points) * both[:, None]
-        points[both, 2] = np.minimum(start.points[both, 2], end.points[both, 2])
-        out.append(
-            replace(
-                start, frame=start.frame + step, points=points,
-                point_source=np.where(both, POINT_INTERPOLATED, POINT_ABSENT).astype(np.int8),
-                box_xyxy=(1 - share) * start.box_xyxy + share * end.box_xyxy,
-                score=float((1 - share) * start.score + share * end.score),
-            )
-        )  # fmt: skip
-    return out
+    shares = (np.arange(1, gap) / gap).astype(np.float32)
+    first, last = (1 - shares)[:, None], shares[:, None]
+    points = (first[..., None] * start.points + last[..., None] * end.points) * both[:, None]
+    points[..., 2] = np.where(both, np.minimum(start.points[:, 2], end.points[:, 2]), 0)
+    boxes = first * start.box_xyxy + last * end.box_xyxy
+    scores = (1 - shares) * start.score + shares * end.score
+    source = np.where(both, POINT_INTERPOLATED, POINT_ABSENT).astype(np.int8)
+    return [
+        replace(
+            start, frame=start.frame + 1 + step, points=points[step], point_source=source, box_xyxy=boxes[step],
+            score=float(scores[step]),
+        )
+        for step in range(gap - 1)
+    ]  # fmt: skip
 
 
 def box_diagonal(box_xyxy: np.ndarray) -> float:

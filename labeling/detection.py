@@ -181,15 +181,12 @@ def suppress_overlaps(boxes_xyxy: np.ndarray, labels: np.ndarray, iou_threshold:
     Returns:
         Indices of the boxes that stay, best first.
     """
+    double = (iou(boxes_xyxy, boxes_xyxy) > iou_threshold) & (labels[:, None] == labels)
     alive = np.ones(len(boxes_xyxy), bool)
-    kept = []
     for i in range(len(boxes_xyxy)):
-        if not alive[i]:
-            continue
-        kept.append(i)
-        rivals = i + 1 + np.flatnonzero(alive[i + 1 :] & (labels[i + 1 :] == labels[i]))
-        alive[rivals[iou(boxes_xyxy[[i]], boxes_xyxy[rivals])[0] > iou_threshold]] = False
-    return np.array(kept, dtype=np.intp)
+        if alive[i]:
+            alive[i + 1 :] &= ~double[i, i + 1 :]
+    return np.flatnonzero(alive)
 
 
 def soften_overlaps(

@@ -134,7 +134,7 @@ def _on_grid(labels: Sequence[Keypoints], shown: Sequence[int], *, first_frame: 
     for label in labels:
         by_moment.setdefault(label.frame, []).append(label)
     return [
-        replace(label, frame=number)
+        label if label.frame == number else replace(label, frame=number)
         for number, moment in enumerate(shown, start=first_frame)
         for label in by_moment.get(moment, [])
     ]

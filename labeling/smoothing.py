@@ -99,8 +99,10 @@ def fill_holes(points: np.ndarray, fill_frames: int) -> tuple[np.ndarray, np.nda
     """
     points = points.copy()
     made_up = np.zeros(points.shape[:2], bool)
-    for k in range(points.shape[1]):
-        seen = np.flatnonzero(points[:, k, 2] > 0)
+    there = points[..., 2] > 0
+    ever_before, ever_after = np.maximum.accumulate(there), np.maximum.accumulate(there[::-1])[::-1]
+    for k in np.flatnonzero((ever_before & ever_after & ~there).any(axis=0)):
+        seen = np.flatnonzero(there[:, k])
         steps = np.diff(seen)
         for n in np.flatnonzero((steps > 1) & (steps <= fill_frames + 1)):
             before, after = seen[n], seen[n + 1]

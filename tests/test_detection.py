@@ -261,3 +261,13 @@ def test_the_real_detector_finds_several_cars_in_most_frames(real_data: Path) ->
     assert np.mean(np.array(counts) >= 2) > 0.8 and np.median(counts) >= 3
     (sixtieth,) = detector.detect([frames[3]])
     assert len(sixtieth.of_category("car")) == 5
+
+
+@pytest.mark.parametrize("size", [(96, 160), (30, 200), (200, 30)], ids=str)
+def test_the_letterbox_leaves_nothing_of_what_was_there(size: tuple[int, int]) -> None:
+    frame = np.random.default_rng(0).integers(0, 256, (*size, 3), dtype=np.uint8)
+    card = toy_card(channel_order="rgb", mean=(10, 20, 30), std=(2, 3, 4))
+    batch = np.full((2, 3, HEIGHT, WIDTH), np.nan, np.float32)
+    letterbox(frame, card, out=batch[1])
+    np.testing.assert_array_equal(batch[1], letterbox(frame, card)[0])
+    assert np.isnan(batch[0]).all()

@@ -200,8 +200,13 @@ def test_one_network_serves_cars_and_lanes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(96, 128), (192, 256), (96, 64), (540, 960)], ids=str)
 def test_padding_is_right_and_bottom_in_the_mean_colour(size: tuple[int, int]) -> None:
-    planes, ratio = padded_input(np.full((*size, 3), 255, np.uint8), field_card())
+    frame, batch = np.full((*size, 3), 255, np.uint8), np.full((2, 3, 97, 129), np.nan, np.float32)
+    planes, ratio = padded_input(frame, field_card())
     height, width = round(size[0] * ratio), round(size[1] * ratio)
+    # Where a batch is waiting, nothing of it is left, and nothing beside it is touched.
+    padded_input(frame, field_card(), out=batch[1])
+    np.testing.assert_array_equal(batch[1], planes)
+    assert np.isnan(batch[0]).all()
     assert planes.shape == (3, 97, 129) and width <= 128 and height <= 96
     assert planes[:, :height, :width].min() > 2 and not planes[:, height:].any() and not planes[:, :, width:].any()
 

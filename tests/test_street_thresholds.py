@@ -6,7 +6,7 @@ from labeling.detection import Detections
 from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
 from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, plan_lessons, plan_streets
 from training.street_pool import ObjectTruth
-from training.street_scores import Tally, judge_car_fields
+from training.street_scores import Tally, grouped_standard_error, judge_car_fields
 from training.street_thresholds import BOX_SCORES, best_threshold, judge_count, sure_threshold
 
 
@@ -109,3 +109,10 @@ def test_learners_see_every_scene_crowded_and_not_from_any_camera() -> None:
 def test_judges_see_streets_as_they_are() -> None:
     walkers = {plan.config.walkers_per_100_m for plan in plan_streets(7, 40)}
     assert walkers == {None}
+
+
+def test_frames_of_one_street_count_as_one() -> None:
+    # Means 1, 0, 1, 0: a deviation of sqrt(1/3), four streets.
+    outcomes = np.repeat([1.0, 0.0, 1.0, 0.0], 6)
+    np.testing.assert_allclose(grouped_standard_error(outcomes.tolist(), 6), np.sqrt(1 / 3) / 2)
+    assert grouped_standard_error(outcomes.tolist(), 1) < 0.5 * grouped_standard_error(outcomes.tolist(), 6)

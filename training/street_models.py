@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import get_args
 
 import cv2
-import numpy as np
 import torch
 
 from labeling.detection import Detector
@@ -34,7 +33,7 @@ from training.street_fitting import fit, is_finished, load_finished
 from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, judging_frames, plan_lessons
 from training.street_pool import StreetPool, render_pool
 from training.street_recipes import BUDGETS, MODEL_NAMES, Device, ModelName, Recipe, recipe
-from training.street_scores import StreetModels, Tally, judge_frame
+from training.street_scores import StreetModels, Tally, grouped_standard_error, judge_frame
 from training.street_thresholds import choose_thresholds
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
@@ -104,10 +103,8 @@ def evaluate(folder: Path, *, streets: int = JUDGED_STREETS, frames: int = JUDGE
     for rgb, truths in judging_frames(HELD_OUT_SEED, streets, frames):
         judge_frame(models, rgb, truths, tally)
     figures = tally.figures()
-    if "count_exact" in tally.hits and streets > 1:
-        shares = np.reshape(tally.hits["count_exact"], (streets, frames)).mean(axis=1)
-        # Frames of one street are not independent, streets are.
-        figures["count_exact_standard_error"] = round(float(shares.std(ddof=1) / np.sqrt(streets)), 4)
+    if models.detector is not None and streets > 1:
+        figures["count_exact_standard_error"] = round(grouped_standard_error(tally.hits["count_exact"], frames), 4)
     return figures
 
 

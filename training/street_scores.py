@@ -71,6 +71,17 @@ def is_judged(truth: BoxTruth) -> bool:
     return bool(truth.box_xyxy[3] - truth.box_xyxy[1] >= JUDGED_HEIGHT_PX and truth.visible_share >= JUDGED_SHARE)
 
 
+def grouped_standard_error(values: Sequence[float], size: int) -> float:
+    """Standard error of the mean of values that come in groups of ``size``: groups are independent, their members not.
+
+    Args:
+        values: two groups or more, one after the other.
+        size: of each group.
+    """
+    means = np.reshape(values, (-1, size)).mean(axis=1)
+    return float(means.std(ddof=1) / np.sqrt(len(means)))
+
+
 def judge_frame(models: StreetModels, rgb: np.ndarray, truths: tuple[ObjectTruth, ...], tally: Tally) -> None:
     """Add one frame's outcomes to ``tally``."""
     if models.detector is not None:
