@@ -192,6 +192,22 @@ def test_points_that_one_end_lacks_are_not_made_up() -> None:
     assert all(label.points[3, 2] == 0 for label in interpolate_gap(start, end))
 
 
+def test_a_gap_is_crossed_on_straight_lines() -> None:
+    start = MovingCard(speed=0).label(5)
+    end = replace(moved(start, 9, 8.0), score=start.score / 2, box_xyxy=start.box_xyxy + 12)
+    end.points[::2, 2] /= 2
+    between = interpolate_gap(start, end)
+    assert [label.frame for label in between] == [6, 7, 8]
+    for label, share in zip(between, (0.25, 0.5, 0.75), strict=True):
+        np.testing.assert_allclose(label.points[:, :2], start.points[:, :2] + (8 * share, 0), atol=1e-4)
+        # No surer than the less sure end; the object itself fades evenly.
+        np.testing.assert_array_equal(label.points[:, 2], end.points[:, 2])
+        np.testing.assert_allclose(label.box_xyxy, start.box_xyxy + 12 * share, atol=1e-4)
+        assert label.score == pytest.approx(start.score * (1 - share / 2), abs=1e-6)
+        assert (label.point_source == POINT_INTERPOLATED).all()
+    assert interpolate_gap(start, replace(end, frame=6)) == []
+
+
 def test_unknown_extractors_are_named() -> None:
     with pytest.raises(ConfigError, match="yolox_nano"):
         choose_extractors(["yolo_nano"])
