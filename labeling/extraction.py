@@ -8,19 +8,20 @@ A picture that is shown again is the same moment: nothing moves, nothing is look
 start from rest. Everything here therefore counts moments, and tells frames only at its ends.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
 import cv2
 import numpy as np
 
+from labeling.backward_tracking import TrackedLook, reach_back
 from labeling.between_looks import BetweenLooks
 from labeling.carrying import small_grey
 from labeling.detection import suppress_overlaps
 from labeling.efforts import EFFORTS, Effort, EffortSettings, Rhythm
 from labeling.extractors import Extractors
-from labeling.labels import Keypoints
+from labeling.labels import UNTRACKED, Keypoints
 from labeling.observation import Look, looks_of
 from labeling.picture_turn import picture_turn, turn_view
 from labeling.smoothing import smooth_tracks
@@ -91,9 +92,18 @@ def label_with(
     fresh = frozenset(moment for moment, number in enumerate(moments) if number in breaks)
     labels = _on_grid(without_doubles(smooth_tracks(labels, breaks=fresh)), shown, first_frame=first_frame)
     sure_scores = {category: score for channel in channels for category, score in channel.sure_scores.items()}
+    last = first_frame + len(shown) - 1
+    ends = {first_frame, last, *breaks, *(number - 1 for number in breaks)}
+    return _believed(labels, settings, sure_scores, open_at=ends)
+
+
+def _believed(
+    labels: Sequence[Keypoints], settings: EffortSettings, sure_scores: Mapping[str, float], *, open_at: Collection[int]
+) -> list[Keypoints]:
     return drop_passing_tracks(
-        labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES, sure_looks=settings.sure_looks, sure_scores=sure_scores
-    )
+        labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES, sure_looks=settings.sure_looks, sure_scores=sure_scores,
+        open_at=open_at,
+    )  # fmt: skip
 
 
 def without_doubles(labels: Iterable[Keypoints]) -> list[Keypoints]:
@@ -176,6 +186,8 @@ class _Channel:
         self._far: tuple[np.ndarray, int] | None = None
         self._turned = np.eye(3)
         self._latest: tuple[_Views, int] | None = None
+        self._looks: list[TrackedLook] = []
+        self._first_label = len(self.labels)
 
     def push(self, views: _Views, *, number: int, fresh: bool) -> None:
         """The next frame of the run; ``fresh`` when nothing of the one before it holds any more."""
@@ -193,9 +205,14 @@ class _Channel:
             self._look(views, number)
 
     def finish(self) -> None:
-        """The run, or what came before a cut, ends: its last frame is looked at, so that nothing carried stays open."""
+        """The run, or what came before a cut, ends: its last frame is looked at, so that nothing carried stays open,
+        and what is known by then is found in earlier looks."""
         if self._latest and self._latest[1] != self._between.frame:
             self._look(*self._latest)
+        if self._looks:
+            ends = {self._looks[0].frame, self._looks[-1].frame}
+            known = _believed(self.labels[self._first_label :], self.settings, self.sure_scores, open_at=ends)
+            self.labels += reach_back(self._looks, {label.track_id for label in known})
 
     def _look(self, views: _Views, number: int) -> None:
         if self._between.arriving(number):
@@ -203,7 +220,9 @@ class _Channel:
         self._turn(views, number)
         seen = [replace(label, frame=number) for label in self.look.see(views.frame, views.number)]
         carried = self._between.carried(number)
-        seen = self._tracker.update(seen, frame=number, previous_to_current=self._turned, carried=carried)
+        named = self._tracker.identify(seen, frame=number, previous_to_current=self._turned, carried=carried)
+        self._looks.append(TrackedLook(frame=number, labels=tuple(named), turn=self._turned))
+        seen = [label for label in named if label.track_id != UNTRACKED]
         self._turned = np.eye(3)
         if self._far is None and not self._tracker.idle:
             self._far = (views.far, number)

@@ -1,6 +1,6 @@
 """Track ids of a run: every category with its tracker, and what is too short to be believed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -43,7 +43,19 @@ class RunTracker:
         previous_to_current: np.ndarray | None = None,
         carried: Mapping[int, np.ndarray] | None = None,
     ) -> list[Keypoints]:
-        """One frame's labels with ids; those that belong to no track are left out.
+        """As ``identify``, without the labels that belong to no track."""
+        named = self.identify(labels, frame=frame, previous_to_current=previous_to_current, carried=carried)
+        return [label for label in named if label.track_id != UNTRACKED]
+
+    def identify(
+        self,
+        labels: Sequence[Keypoints],
+        *,
+        frame: int,
+        previous_to_current: np.ndarray | None = None,
+        carried: Mapping[int, np.ndarray] | None = None,
+    ) -> list[Keypoints]:
+        """One frame's labels with their ids, ``UNTRACKED`` where they belong to no track.
 
         Args:
             labels: everything seen in the frame.
@@ -61,7 +73,7 @@ class RunTracker:
             tracker.next_id = self._next_id
             ids = _update(tracker, group, step, previous_to_current, carried)
             self._next_id = tracker.next_id
-            out += [replace(label, track_id=int(i)) for label, i in zip(group, ids, strict=True) if i != UNTRACKED]
+            out += [replace(label, track_id=int(i)) for label, i in zip(group, ids, strict=True)]
         return out
 
     def _new_tracker(self, category: str) -> "BoxTracker | LaneTracker":
@@ -100,6 +112,7 @@ def drop_passing_tracks(
     min_frames: int,
     sure_looks: int = 0,
     sure_scores: Mapping[str, float] | None = None,
+    open_at: Collection[int] = (),
 ) -> list[Keypoints]:
     """Without a network's mistakes: tracks of too few looks, of too few that were sure, or of too few frames.
 
@@ -111,8 +124,9 @@ def drop_passing_tracks(
         min_frames: from its first frame to its last.
         sure_looks: how many of the looks must have been sure.
         sure_scores: by category, the score from which a look is sure; any score where nothing is said.
+        open_at: the frames at which a run begins and ends: who is there has been, or will be, for longer than it shows.
     """
-    sure_scores = sure_scores or {}
+    sure_scores, open_at = sure_scores or {}, frozenset(open_at)
     looks: dict[int, int] = {}
     sure: dict[int, int] = {}
     frames: dict[int, list[int]] = {}
@@ -127,7 +141,10 @@ def drop_passing_tracks(
         for label in labels
         if looks[label.track_id] >= min_looks
         and sure[label.track_id] >= sure_looks
-        and max(frames[label.track_id]) - min(frames[label.track_id]) + 1 >= min_frames
+        and (
+            max(frames[label.track_id]) - min(frames[label.track_id]) + 1 >= min_frames
+            or not open_at.isdisjoint(frames[label.track_id])
+        )
     ]
 
 
