@@ -6,29 +6,19 @@ from the last look to the first, in which only believed tracks begin and what no
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from labeling.box_tracker import BoxTracker, TrackerSettings
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.schemas import Category
+from labeling.tracking import TrackedLook
 
 _REACH = TrackerSettings(max_lost_frames=12)
 """As the forward association, over half a second: what was not seen for longer began anew."""
 _OWNED, _FREE = 1.0, 0.0
 """Scores above and below the tracker's ``high_score``."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TrackedLook:
-    """Everything that one look saw, after the forward association."""
-
-    frame: int
-    labels: tuple[Keypoints, ...]
-    """With the ids of their tracks, or ``UNTRACKED``."""
-    turn: np.ndarray
-    """(3, 3) homography that the camera's turn since the look before makes of far points."""
 
 
 def reach_back(

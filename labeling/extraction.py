@@ -5,17 +5,18 @@ between these the points of cars and people are carried by optical flow, and lan
 follow, by straight lines. How often they look is ``efforts``'; what is shown in between is ``between_looks``'.
 
 A picture that is shown again is the same moment: nothing moves, nothing is looked at, and what follows it does not
-start from rest. Everything here therefore counts moments, and tells frames only at its ends.
+start from rest. Tracks, flow and smoothing therefore count moments; how long until the next look, how long something
+must last, and how long after its last sight it may be shown, are times, and count frames of the grid.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 
 import cv2
 import numpy as np
 
-from labeling.backward_tracking import TrackedLook, reach_back
+from labeling.backward_tracking import reach_back
 from labeling.between_looks import BetweenLooks
 from labeling.carrying import small_grey
 from labeling.detection import suppress_overlaps
@@ -24,16 +25,18 @@ from labeling.extractors import Extractors
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.observation import Look, looks_of
 from labeling.picture_turn import picture_turn, turn_view
-from labeling.smoothing import smooth_tracks
-from labeling.tracking import RunTracker, drop_passing_tracks
+from labeling.smoothing import SmoothingSettings, drop_unseen, smooth_tracks
+from labeling.tracking import RunTracker, TrackedLook, believed_tracks, drop_brief_tracks
 
 _COVERED_IOU = 0.6
 """Overlap of two labels of one category of which the lesser is not in view; visible parts overlap by up to 0.55."""
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
-"""What lasts less than a quarter of a second, or was seen once, is taken for a mistake."""
+"""What was seen once, or lasts less than a quarter of a second, is taken for a mistake."""
 _SAMPLE, _SAME_LEVELS = 16, 2
 """Every so many pixels are compared before all are; and by how many levels they may differ."""
+_PACE_MOMENTS = 9
+"""So many moments tell how fast the source runs: a camera that froze is none of fewer frames."""
 _TURN_STEP = 4
 """Frames after which two pictures of a camera that turns sharply have too little in common."""
 
@@ -78,32 +81,31 @@ def label_with(
     channels = [_Channel(look, settings) for look in looks]
     moments: list[int] = []
     shown: list[int] = []
+    clocks: list[int] = []
     latest = None
     for number, frame in enumerate(frames, start=first_frame):
         if latest is None or number in breaks or not same_picture(latest, frame):
             views, latest = _Views(frame, number), frame
+            clocks.append((clocks[-1] if clocks else 0) + _pace([*moments[-_PACE_MOMENTS:], number]))
             for channel in channels:
-                channel.push(views, number=len(moments), fresh=number in breaks)
+                channel.push(views, number=len(moments), clock=clocks[-1], fresh=number in breaks)
             moments.append(number)
         shown.append(len(moments) - 1)
     for channel in channels:
         channel.finish()
     labels = _renumbered([channel.labels for channel in channels])
     fresh = frozenset(moment for moment, number in enumerate(moments) if number in breaks)
-    labels = _on_grid(without_doubles(smooth_tracks(labels, breaks=fresh)), shown, first_frame=first_frame)
-    sure_scores = {category: score for channel in channels for category, score in channel.sure_scores.items()}
+    windows = SmoothingSettings().at_pace(_pace(moments))
+    labels = drop_unseen(without_doubles(smooth_tracks(labels, settings=windows, breaks=fresh)), clocks)
+    labels = _on_grid(labels, shown, first_frame=first_frame)
     last = first_frame + len(shown) - 1
     ends = {first_frame, last, *breaks, *(number - 1 for number in breaks)}
-    return _believed(labels, settings, sure_scores, open_at=ends)
+    return _renumbered([drop_brief_tracks(labels, min_frames=_MIN_FRAMES, open_at=ends)])
 
 
-def _believed(
-    labels: Sequence[Keypoints], settings: EffortSettings, sure_scores: Mapping[str, float], *, open_at: Collection[int]
-) -> list[Keypoints]:
-    return drop_passing_tracks(
-        labels, min_looks=_MIN_LOOKS, min_frames=_MIN_FRAMES, sure_looks=settings.sure_looks, sure_scores=sure_scores,
-        open_at=open_at,
-    )  # fmt: skip
+def _pace(moments: Sequence[int]) -> int:
+    """For how many frames a picture is usually shown: more than one where the source has fewer than the grid."""
+    return int(np.median(np.diff(moments))) if len(moments) > 1 else 1
 
 
 def without_doubles(labels: Iterable[Keypoints]) -> list[Keypoints]:
@@ -186,19 +188,27 @@ class _Channel:
         self._far: tuple[np.ndarray, int] | None = None
         self._turned = np.eye(3)
         self._latest: tuple[_Views, int] | None = None
+        self._clock = self._looked_at = 0
         self._looks: list[TrackedLook] = []
-        self._first_label = len(self.labels)
+        self._labels: list[Keypoints] = []
 
-    def push(self, views: _Views, *, number: int, fresh: bool) -> None:
-        """The next frame of the run; ``fresh`` when nothing of the one before it holds any more."""
+    def push(self, views: _Views, *, number: int, clock: int, fresh: bool) -> None:
+        """The next moment of the run.
+
+        Args:
+            views: its picture.
+            number: of the moment.
+            clock: frames of the grid up to here, had no picture been shown for longer than is usual in this source.
+            fresh: nothing of what came before holds any more.
+        """
         if fresh:
             self.finish()
             self._forget()
-        self._latest = (views, number)
+        self._latest, self._clock = (views, number), clock
         if self._far and number - self._far[1] >= _TURN_STEP:
             self._turn(views, number)
         last = self._between.frame
-        due = last is None or number - last >= self._rhythm.gap
+        due = last is None or clock - self._looked_at >= self._rhythm.gap
         if not due and self._between.due(number):
             due = not self._between.carry(views.grey, frame=number)
         if due:
@@ -209,10 +219,11 @@ class _Channel:
         and what is known by then is found in earlier looks."""
         if self._latest and self._latest[1] != self._between.frame:
             self._look(*self._latest)
-        if self._looks:
-            ends = {self._looks[0].frame, self._looks[-1].frame}
-            known = _believed(self.labels[self._first_label :], self.settings, self.sure_scores, open_at=ends)
-            self.labels += reach_back(self._looks, {label.track_id for label in known})
+        believed = believed_tracks(
+            self._looks, min_looks=_MIN_LOOKS, sure_looks=self.settings.sure_looks, sure_scores=self.sure_scores
+        )
+        self._labels = [label for label in self._labels if label.track_id in believed]
+        self.labels += self._labels + reach_back(self._looks, believed)
 
     def _look(self, views: _Views, number: int) -> None:
         if self._between.arriving(number):
@@ -228,8 +239,9 @@ class _Channel:
             self._far = (views.far, number)
         self.looks += 1
         between, miss = self._between.close(seen, frame=number)
-        self.labels += between + seen
-        self._rhythm.after(seen, self._between.seen, miss=miss, frame=number)
+        self._labels += between + seen
+        self._rhythm.after(seen, self._between.seen, miss=miss, frame=self._clock)
+        self._looked_at = self._clock
         follow = seen and self._rhythm.flows and self._rhythm.gap > 1
         self._between.start(seen, frame=number, grey=views.grey if follow else None)
 

@@ -6,19 +6,20 @@ a narrow fit agree within the noise the wide one is taken, which is how a parked
 (the intersection of confidence intervals of Goldenshluger and Nemirovski 1997, for two windows).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
 
-from labeling.labels import POINT_INTERPOLATED, Keypoints
+from labeling.carrying import UNSEEN_FRAMES
+from labeling.labels import POINT_ABSENT, POINT_DETECTED, POINT_INTERPOLATED, Keypoints
 from labeling.medians import masked_median
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmoothingSettings:
-    """Windows are half-widths in frames of the 24 fps grid."""
+    """Windows are half-widths in moments; as they stand, in frames of the 24 fps grid."""
 
     narrow: int = 5
     """Wide enough to halve white noise, narrow enough for a walking leg (1 Hz passes at 99 %)."""
@@ -27,7 +28,12 @@ class SmoothingSettings:
     agreement: float = 1.0
     """The wide fit is used where it is nearer to the narrow one than this many noise sigmas."""
     fill_frames: int = 6
-    """Longest hole in a track that is filled: so nothing is ever shown that was not seen within 0.25 s."""
+    """Longest hole in a track that is filled."""
+
+    def at_pace(self, frames: int) -> "SmoothingSettings":
+        """The same times for a source of fewer frames, each of whose pictures is shown for ``frames`` of the grid."""
+        narrow, wide = (-(-window // frames) for window in (self.narrow, self.wide))
+        return replace(self, narrow=narrow, wide=wide, fill_frames=self.fill_frames // frames)
 
 
 def smooth_tracks(
@@ -57,6 +63,38 @@ def smooth_tracks(
         groups.setdefault((label.track_id, label.schema, part), []).append(label)
     smoothed = [label for group in groups.values() for label in _smooth_track(group, settings)]
     return sorted(smoothed, key=lambda label: (label.frame, label.track_id))
+
+
+def drop_unseen(
+    labels: Sequence[Keypoints], clocks: Sequence[int], *, max_frames: int = UNSEEN_FRAMES
+) -> list[Keypoints]:
+    """Without points, and objects, that were not detected within ``max_frames`` of when they are shown.
+
+    Args:
+        labels: tracked, by moment. Objects without any detected point, boxes alone, are left as they are.
+        clocks: time of each moment, frames of the grid; where a camera froze, without that.
+        max_frames: of the grid, before or after.
+    """
+    groups: dict[int, list[int]] = {}
+    for index, label in enumerate(labels):
+        groups.setdefault(label.track_id, []).append(index)
+    kept: list[Keypoints | None] = list(labels)
+    for indices in groups.values():
+        track = [labels[i] for i in indices]
+        frames = np.array([clocks[label.frame] for label in track])[:, None]
+        detected = np.array([label.point_source for label in track]) == POINT_DETECTED
+        shown = np.array([label.present for label in track])
+        if not detected.any():
+            continue
+        before = np.maximum.accumulate(np.where(detected, frames, -np.inf))
+        after = np.minimum.accumulate(np.where(detected, frames, np.inf)[::-1])[::-1]
+        unseen = np.minimum(frames - before, after - frames) > max_frames
+        for row in np.flatnonzero((unseen & shown).any(axis=1)):
+            points, source = track[row].points.copy(), track[row].point_source.copy()
+            points[unseen[row]], source[unseen[row]] = 0, POINT_ABSENT
+            gone = unseen[row].all()
+            kept[indices[row]] = None if gone else replace(track[row], points=points, point_source=source)
+    return [label for label in kept if label is not None]
 
 
 def _smooth_track(group: list[Keypoints], settings: SmoothingSettings) -> list[Keypoints]:

@@ -1,13 +1,25 @@
 """Track ids of a run: every category with its tracker, and what is too short to be believed."""
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from labeling.box_tracker import BoxTracker, TrackerSettings
-from labeling.labels import POINT_DETECTED, UNTRACKED, Keypoints
+from labeling.labels import UNTRACKED, Keypoints
 from labeling.lane_tracker import LaneTracker
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackedLook:
+    """Everything that one look saw, after the association with earlier ones."""
+
+    frame: int
+    labels: tuple[Keypoints, ...]
+    """With the ids of their tracks, or ``UNTRACKED``."""
+    turn: np.ndarray
+    """(3, 3) homography that the camera's turn since the look before makes of far points."""
 
 
 class RunTracker:
@@ -105,47 +117,44 @@ def assign_tracks(
     return tracked
 
 
-def drop_passing_tracks(
-    labels: Sequence[Keypoints],
-    *,
-    min_looks: int,
-    min_frames: int,
-    sure_looks: int = 0,
-    sure_scores: Mapping[str, float] | None = None,
-    open_at: Collection[int] = (),
-) -> list[Keypoints]:
-    """Without a network's mistakes: tracks of too few looks, of too few that were sure, or of too few frames.
+def believed_tracks(
+    looks: Iterable[TrackedLook], *, min_looks: int, sure_looks: int = 0, sure_scores: Mapping[str, float] | None = None
+) -> frozenset[int]:
+    """Ids of the tracks that are more than a network's mistake: seen often enough, and surely enough.
 
-    What flow carried or a neighbour lent does not count as a look; an object without keypoints counts by its box.
+    Args:
+        looks: with their tracks; what was carried or lent between them is no look.
+        min_looks: how often it must have been seen.
+        sure_looks: how many of the looks must have been sure.
+        sure_scores: by category, the score from which a look is sure; any score where nothing is said.
+    """
+    sure_scores = sure_scores or {}
+    seen: Counter[int] = Counter()
+    sure: Counter[int] = Counter()
+    for label in (label for look in looks for label in look.labels if label.track_id != UNTRACKED):
+        seen[label.track_id] += 1
+        sure[label.track_id] += label.score >= sure_scores.get(label.category, 0.0)
+    return frozenset(i for i, count in seen.items() if count >= min_looks and sure[i] >= sure_looks)
+
+
+def drop_brief_tracks(
+    labels: Sequence[Keypoints], *, min_frames: int, open_at: Collection[int] = ()
+) -> list[Keypoints]:
+    """Without tracks that last less than ``min_frames`` from their first frame to their last.
 
     Args:
         labels: tracked.
-        min_looks: how often it must have been seen.
-        min_frames: from its first frame to its last.
-        sure_looks: how many of the looks must have been sure.
-        sure_scores: by category, the score from which a look is sure; any score where nothing is said.
+        min_frames: least length.
         open_at: the frames at which a run begins and ends: who is there has been, or will be, for longer than it shows.
     """
-    sure_scores, open_at = sure_scores or {}, frozenset(open_at)
-    looks: dict[int, int] = {}
-    sure: dict[int, int] = {}
+    open_at = frozenset(open_at)
     frames: dict[int, list[int]] = {}
     for label in labels:
-        seen = not label.present.any() or (label.point_source == POINT_DETECTED).any()
-        believed = seen and label.score >= sure_scores.get(label.category, 0.0)
-        looks[label.track_id] = looks.get(label.track_id, 0) + bool(seen)
-        sure[label.track_id] = sure.get(label.track_id, 0) + bool(believed)
         frames.setdefault(label.track_id, []).append(label.frame)
-    return [
-        label
-        for label in labels
-        if looks[label.track_id] >= min_looks
-        and sure[label.track_id] >= sure_looks
-        and (
-            max(frames[label.track_id]) - min(frames[label.track_id]) + 1 >= min_frames
-            or not open_at.isdisjoint(frames[label.track_id])
-        )
-    ]
+    lasting = {
+        i for i, shown in frames.items() if max(shown) - min(shown) + 1 >= min_frames or not open_at.isdisjoint(shown)
+    }
+    return [label for label in labels if label.track_id in lasting]
 
 
 def _update(

@@ -14,6 +14,7 @@ from labeling.errors import ConfigError, ModelError
 from labeling.extraction import label_with, same_picture, without_doubles
 from labeling.extractors import choose_extractors
 from labeling.labels import POINT_CARRIED, POINT_DETECTED, POINT_INTERPOLATED, Keypoints
+from labeling.smoothing import SmoothingSettings
 
 
 @pytest.mark.parametrize(("effort", "least_saving"), [("exact", 1), ("balanced", 4), ("fast", 6)])
@@ -141,6 +142,66 @@ def test_an_empty_road_is_looked_at_twice_a_second() -> None:
 def test_what_passes_in_a_blink_is_no_object() -> None:
     scene = MovingCard(shown=range(10, 13))
     assert label_with([scene], (scene.render(t) for t in range(40)), first_frame=0, effort="exact") == []
+
+
+class SeenOnce(MovingCard):
+    """A card that a network takes for an object in one look alone, with or without the points of a head."""
+
+    def __init__(self, look: int, *, points: bool) -> None:
+        super().__init__()
+        self.look, self.points = look, points
+
+    def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
+        found = super().see(frame, number) if len(self.seen) == self.look else []
+        self.seen += [] if found else [number]
+        return [label if self.points else without_points(label) for label in found]
+
+
+def without_points(label: Keypoints) -> Keypoints:
+    return replace(label, points=0 * label.points, point_source=0 * label.point_source)
+
+
+@pytest.mark.parametrize("shown", [1, 2, 8])
+@pytest.mark.parametrize("points", [True, False])
+@pytest.mark.parametrize("effort", ["exact", "balanced", "fast"])
+def test_what_one_look_alone_saw_is_no_object(effort: Effort, points: bool, shown: int) -> None:
+    """However long it was carried, and however often its picture was shown again."""
+    scene = SeenOnce(4, points=points)
+    frames = (scene.render(t // shown) for t in range(60 * shown))
+    assert label_with([scene], frames, first_frame=0, effort=effort) == []
+
+
+@pytest.mark.parametrize("every", [2, 3])
+@pytest.mark.parametrize("effort", ["balanced", "fast"])
+def test_sources_of_fewer_frames_show_nothing_long_unseen(effort: Effort, every: int) -> None:
+    """At 12 and 8 fps, as at 24: a quarter of a second after the last sight at most, and looks as often a second."""
+    for last in range(60, 72):
+        scene = MovingCard(speed=0.5, shown=range(last))
+        frames = (scene.render(t - t % every) for t in range(120))
+        labels = label_with([scene], frames, first_frame=0, effort=effort)
+        seen = [number for number in scene.seen if number < last]
+        assert max(label.frame for label in labels) <= seen[-1] + 6 + every
+        assert max(np.diff(scene.seen)) <= EFFORTS[effort].max_gap + every
+
+
+def test_a_source_of_fewer_frames_is_smoothed_over_the_same_time() -> None:
+    assert SmoothingSettings().at_pace(1) == SmoothingSettings()
+    assert SmoothingSettings(narrow=5, wide=12, fill_frames=6).at_pace(2) == SmoothingSettings(
+        narrow=3, wide=6, fill_frames=3
+    )
+
+
+def test_ids_count_from_0_whatever_was_dropped() -> None:
+    """A blink before it leaves no gap in the numbers."""
+
+    class Blinks(MovingCard):
+        def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
+            return super().see(frame, number) if number not in (12, 13, 14) else []
+
+    scene = Blinks(shown=range(999), cut=None)
+    frames = [scene.render(t) for t in range(60)]
+    labels = label_with([scene], frames, first_frame=0, effort="exact", breaks=frozenset({2, 4}))
+    assert sorted({label.track_id for label in labels}) == list(range(len({label.track_id for label in labels})))
 
 
 def test_fast_growth_brings_looks_closer() -> None:

@@ -7,11 +7,12 @@ from itertools import product
 import numpy as np
 import pytest
 
+from labeling.backward_tracking import reach_back
 from labeling.box_tracker import BoxTracker, TrackerSettings
 from labeling.boxes import iou
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.lane_tracker import LaneTracker, line_distance
-from labeling.tracking import RunTracker, assign_tracks, drop_passing_tracks
+from labeling.tracking import RunTracker, TrackedLook, assign_tracks, believed_tracks, drop_brief_tracks
 
 
 def box(x: float, y: float = 300, *, width: float = 40, height: float = 100) -> np.ndarray:
@@ -152,21 +153,73 @@ def test_nothing_is_carried_over_a_break() -> None:
     assert [labels[0].track_id for labels in cut] == [0] * 5 + [1] * 5
 
 
-def test_passing_tracks_are_dropped_and_only_they() -> None:
-    frames = [[car(t, 100)] + ([car(t, 800)] if t == 4 else []) for t in range(10)]
-    tracked = [label for labels in assign_tracks(frames) for label in labels]
-    kept = drop_passing_tracks(tracked, min_looks=2, min_frames=6)
-    assert [label.frame for label in kept] == list(range(10))
-    assert drop_passing_tracks(tracked, min_looks=1, min_frames=1) == tracked
+def looks(*frames: list[Keypoints]) -> list[TrackedLook]:
+    """What an association of these looks gives, one a frame."""
+    tracker = RunTracker()
+    return [
+        TrackedLook(frame=t, labels=tuple(tracker.identify(labels, frame=t)), turn=np.eye(3))
+        for t, labels in enumerate(frames)
+    ]
 
 
-def test_a_track_that_was_sure_only_once_is_dropped() -> None:
-    frames = [[replace(car(t, 100), score=0.9 if t in sure else 0.4)] for sure in ((0,), (0, 5)) for t in range(10)]
-    for part, kept in ((frames[:10], 0), (frames[10:], 10)):
-        tracked = [label for labels in assign_tracks(part) for label in labels]
-        sure = {"sure_looks": 2, "sure_scores": {"car": 0.5}}
-        assert len(drop_passing_tracks(tracked, min_looks=2, min_frames=6, **sure)) == kept
-        assert drop_passing_tracks(tracked, min_looks=2, min_frames=6) == tracked
+def test_tracks_seen_once_are_not_believed() -> None:
+    seen = looks(*([car(t, 100)] + ([car(t, 800)] if t == 4 else []) for t in range(10)))
+    assert believed_tracks(seen, min_looks=2) == {0}
+    assert believed_tracks(seen, min_looks=1) == {0, 1}
+
+
+def test_a_track_that_was_sure_only_once_is_not_believed() -> None:
+    for sure, believed in (((0,), set()), ((0, 5), {0})):
+        seen = looks(*([replace(car(t, 100), score=0.9 if t in sure else 0.4)] for t in range(10)))
+        assert believed_tracks(seen, min_looks=2, sure_looks=2, sure_scores={"car": 0.5}) == believed
+        assert believed_tracks(seen, min_looks=2) == {0}
+
+
+def test_brief_tracks_are_dropped_but_where_a_run_begins_or_ends() -> None:
+    long, brief = ([replace(car(t, 100), track_id=n) for t in range(*span)] for n, span in enumerate(((0, 9), (3, 7))))
+    assert drop_brief_tracks([*long, *brief], min_frames=5) == long
+    assert drop_brief_tracks([*long, *brief], min_frames=4) == [*long, *brief]
+    assert drop_brief_tracks([*long, *brief], min_frames=5, open_at=(6, 20)) == [*long, *brief]
+
+
+def test_a_sure_track_reaches_back_to_what_was_unsure() -> None:
+    """Seen from frame 0, believed from frame 6: the detector was unsure of it until then, and once saw nothing."""
+    seen = looks(*([] if t == 3 else [replace(car(t, 100 + 6 * t), score=0.9 if t >= 6 else 0.3)] for t in range(12)))
+    assert [len([one for one in look.labels if one.track_id != UNTRACKED]) for look in seen] == [0] * 6 + [1] * 6
+    found = reach_back(seen, {0})
+    assert sorted(label.frame for label in found) == [0, 1, 2, 4, 5]
+    assert {label.track_id for label in found} == {0} and {label.score for label in found} == {0.3}
+    assert reach_back(seen, set()) == []
+
+
+def test_no_track_reaches_back_to_what_is_elsewhere_or_long_ago() -> None:
+    far = looks(*([replace(car(t, 100 if t >= 6 else 600), score=0.9 if t >= 6 else 0.3)] for t in range(12)))
+    assert reach_back(far, {0}) == []
+    unseen = looks(*([] if 2 < t < 30 else [replace(car(t, 100), score=0.9 if t >= 30 else 0.3)] for t in range(40)))
+    assert reach_back(unseen, {0}) == []
+
+
+def test_a_track_that_is_seen_takes_no_second_label() -> None:
+    """A double beside the object in every frame stays without a track, and a neighbour's name is not taken."""
+    frames = [[car(t, 100 + t), replace(car(t, 112 + t), score=0.3), car(t, 500)] for t in range(12)]
+    assert reach_back(looks(*frames), {0, 1}) == []
+
+
+def test_reaching_back_follows_a_camera_that_turns() -> None:
+    """90 px a frame: more than the object is wide."""
+    shift = np.array([[1.0, 0, 90], [0, 1, 0], [0, 0, 1]])
+    labels = [replace(car(t, 100 + 90 * t), score=0.9 if t >= 2 else 0.3) for t in range(6)]
+    tracker = RunTracker()
+    seen = [
+        TrackedLook(
+            frame=t, labels=tuple(tracker.identify([label], frame=t, previous_to_current=shift)),
+            turn=shift,
+        )
+        for t, label in enumerate(labels)
+    ]  # fmt: skip
+    assert sorted(label.frame for label in reach_back(seen, {0})) == [0, 1]
+    still = [replace(look, turn=np.eye(3)) for look in seen]
+    assert reach_back(still, {0}) == []
 
 
 def lane(offset: float) -> np.ndarray:
