@@ -109,9 +109,10 @@ def _checked(path: Path, rows: Iterable[tuple[int, dict]]) -> dict[str, str]:
         key, text = row["key"], row["text"]
         if not isinstance(key, str) or not isinstance(text, str) or not key.strip() or not text.strip():
             raise DataError(f"{path}: row {number} has key {key!r} and text {text!r}; give two texts, neither empty")
+        key = key.strip()
         if key in texts:
             raise DataError(f"{path}: row {number} repeats the key {key!r}; give each clip one text")
-        texts[key.strip()] = text.strip()
+        texts[key] = text.strip()
     if not texts:
         raise DataError(f"{path}: holds no captions; give rows of key and text")
     return texts
@@ -127,8 +128,9 @@ def _parquet_rows(path: Path) -> Iterable[tuple[int, dict]]:
 
 
 def _jsonl_rows(path: Path) -> Iterable[tuple[int, dict]]:
-    lines = path.read_text(encoding="utf-8").splitlines()
-    for number, line in enumerate(lines, start=1):
-        if line.strip():
-            row = json.loads(line)
-            yield number, row if isinstance(row, dict) else {}
+    # Lines end at line feeds alone: JSON texts may hold what Unicode calls line separators.
+    with path.open(encoding="utf-8-sig", newline="\n") as file:
+        for number, line in enumerate(file, start=1):
+            if line.strip():
+                row = json.loads(line)
+                yield number, row if isinstance(row, dict) else {}

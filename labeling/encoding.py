@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from labeling.conversion import tag_bt709
 from labeling.errors import ConfigError, StorageError, VideoError
 from labeling.mp4_boxes import indexed_frames
+from labeling.sources import open_video, pick_video_stream
 
 Codec = Literal["libx264", "libx264rgb"]
 Preset = Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow"]
@@ -132,7 +133,13 @@ class VideoWriter:
         self._index += 1
 
     def close(self) -> None:
-        """Flush the encoder, write the index, and check that all of it arrived on the disk."""
+        """Flush the encoder, write the index, and check that all of it arrived on the disk.
+
+        Raises:
+            VideoError: no frame was given.
+        """
+        if not self._index:
+            raise VideoError(f"{self._path.name}: not one frame was given; a video has at least one")
         with storage_errors(self._path):
             self._container.mux(self._stream.encode(None))
             self._container.close()
@@ -165,12 +172,12 @@ def copy_packets(source: Path, out: Path, *, start: int, end: int) -> None:
     """Copy frames ``[start, end)`` of one of our constant-rate files by packets: nothing is decoded.
 
     Raises:
-        VideoError: the file holds no such frames, or they are not whole: ``start`` is no keyframe, or B-frames at the
-            end need a frame beyond it.
+        VideoError: as ``open_video``; the file holds no such frames, or they are not whole: ``start`` is no keyframe,
+            or B-frames at the end need a frame beyond it.
         StorageError: no space left, an unwritable folder.
     """
-    with av.open(str(source)) as container:
-        stream = container.streams.video[0]
+    with open_video(source) as container:
+        stream = pick_video_stream(container, source)
         packets = _packets_between(container, stream, start, end)
         _check_whole(packets, source, start=start, end=end)
         shift = min(packet.pts for packet in packets if packet.pts is not None)

@@ -57,7 +57,7 @@ def choose_extractors(names: Sequence[str] | None, *, models_dir: Path | None = 
         models_dir: where weights lie, as ``find_weights`` takes it.
 
     Raises:
-        ConfigError: a name that no card has.
+        ConfigError: a name that no card has, or of a card that would have no part beside the others.
         ModelError: a card that was asked for by name has no weights.
     """
     cards = load_cards(models_dir)
@@ -70,12 +70,20 @@ def choose_extractors(names: Sequence[str] | None, *, models_dir: Path | None = 
     detectors = [card for card in present if isinstance(card, YoloxCard)]
     fields = [card for card in present if isinstance(card, CifcafCard)]
     heads = [card for card in present if isinstance(card, SimccCard)]
-    return ExtractorChoice(
+    choice = ExtractorChoice(
         detector=detectors[0] if detectors else None,
-        heads=(*_first(heads, "car"), *_person_heads(heads)),
+        heads=(*_first(heads, "car"), *_person_heads(heads)) if detectors else (),
         fields=_one_per_category(fields, taken={card.category for card in heads if detectors}),
         absent=absent,
     )
+    asked = [name for name in names or () if name != "street" and cards[name] not in choice.cards]
+    if asked:
+        used = ", ".join(card.name for card in choice.cards) or "nothing else"
+        raise ConfigError(
+            f"{asked[0]} has no part beside {used}: a job takes one detector, with it a head for cars and one or two "
+            "for people (wholebody133, coco17), and bottom-up networks for what no head gives; leave it out"
+        )
+    return choice
 
 
 def head_category(schema_name: str) -> Category:

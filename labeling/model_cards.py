@@ -285,12 +285,12 @@ def write_card(card: ModelCard, path: Path) -> None:
 
 
 def load_cards(models_dir: Path | None = None) -> dict[str, YoloxCard | SimccCard | CifcafCard]:
-    """The cards that ship, and those in ``models_dir``, by name, sorted.
+    """The cards that ship, and those beside a user's own weights (``weights_folders``), by name, sorted.
 
     Raises:
         ModelError: a card breaks the rules, or two have one name.
     """
-    folders = [SHIPPED_CARDS, *([models_dir] if models_dir and models_dir.resolve() != SHIPPED_CARDS.resolve() else [])]
+    folders = {folder.resolve(): folder for folder in reversed(weights_folders(models_dir))}.values()
     found: dict[str, tuple[YoloxCard | SimccCard | CifcafCard, Path]] = {}
     for path in (path for folder in folders for path in sorted(folder.glob("*.toml"))):
         card = read_card(path)

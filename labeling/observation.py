@@ -39,7 +39,7 @@ def looks_of(extractors: Extractors) -> list[Look]:
     if extractors.detector:
         categories: list[Category] = [c for c in _BOX_SCHEMA if c in extractors.heads or c not in bottom_up]
         looks.append(ObjectLook(extractors, categories))
-    taken: set[Category] = set(extractors.heads)
+    taken: set[Category] = set(extractors.heads) if extractors.detector else set()
     for model in extractors.fields:
         given = _categories(model)
         wanted: list[Category] = [category for category in CATEGORIES if category in given - taken]

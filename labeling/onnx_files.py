@@ -1,5 +1,7 @@
 """ONNX files, checked before any session opens them: what they are, whose they are, and what else they would read."""
 
+import functools
+import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -36,6 +38,38 @@ def check_file(card: ModelCard, path: Path) -> None:
             f"get that file ({card.source}), or write a card of another name for this one"
         )
     check_external_data(path)
+    if card.sha256 is not None and (files := _external_files(path)):
+        raise ModelError(
+            f"{card.name}: {path} keeps weights in {', '.join(file.name for file in files)}, which its card's sha256 "
+            "does not cover; save the model as one file, or leave sha256 out"
+        )
+
+
+def weights_sha256(path: Path) -> str:
+    """Hex SHA-256 of an ONNX file, or, where it keeps tensors in files beside it, of the hashes of all of them."""
+    files = _external_files(path)
+    if not files:
+        return file_sha256(path)
+    return hashlib.sha256(" ".join(file_sha256(file) for file in (path, *files)).encode()).hexdigest()
+
+
+def _external_files(path: Path) -> tuple[Path, ...]:
+    """The files beside an ONNX file that hold some of its tensors, sorted."""
+    status = path.stat()
+    return _checked_external_files(path, status.st_size, status.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=64)
+def _checked_external_files(path: Path, size: int, modified_ns: int) -> tuple[Path, ...]:
+    try:
+        model = onnx.load(str(path), load_external_data=False)
+    except Exception:  # protobuf's DecodeError has no stable home; what is no ONNX says so when it is opened
+        return ()
+    tensors = (tensor for tensor in _tensors(model) if tensor.data_location == onnx.TensorProto.EXTERNAL)
+    names = {entry.value for tensor in tensors for entry in tensor.external_data if entry.key == "location"}
+    folder = path.resolve().parent
+    files = ((folder / name).resolve() for name in sorted(names))
+    return tuple(file for file in files if file.is_relative_to(folder) and file.is_file())
 
 
 def check_external_data(path: Path) -> None:

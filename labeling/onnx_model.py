@@ -10,8 +10,8 @@ import numpy as np
 import onnxruntime
 
 from labeling.errors import ModelError
-from labeling.model_cards import Dimensions, ModelCard, file_sha256
-from labeling.onnx_files import check_file, first_line
+from labeling.model_cards import Dimensions, ModelCard
+from labeling.onnx_files import check_file, first_line, weights_sha256
 
 DEFAULT_PROVIDERS = ("CPUExecutionProvider",)
 PROVIDER_NAMES = {
@@ -69,8 +69,8 @@ class OnnxModel:
 
     @property
     def weights_sha256(self) -> str:
-        """Hex SHA-256 of the ONNX file, for receipts."""
-        return file_sha256(self.path)
+        """Hex SHA-256 of the weights, for receipts."""
+        return weights_sha256(self.path)
 
     def run(self, batch: np.ndarray, *, outputs: Sequence[int] | None = None) -> list[np.ndarray]:
         """The card's outputs, in its order, for any number of inputs.

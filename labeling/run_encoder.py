@@ -33,8 +33,10 @@ class RunEncoder:
         """Take the next frame out of ``converted_frames``; it is encoded if the run wants it."""
         start = self._next
         first, end = _rows(self._wanted_s, frame.time_s)
+        # Some containers repeat a time, or go back in it: what is shown already stays.
+        first = max(first, start)
         self._mark(frame, first, end)
-        if end == first:
+        if end <= first:
             return
         # What was wanted between the last frame and this one never came.
         self.lost[start:first] = True

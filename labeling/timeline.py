@@ -25,6 +25,9 @@ FPS = 24
 
 # Times come from integer ticks of 1e-6 s or more, so a tie is exact but for rounding.
 _TIE_S = 1e-7
+_MOST_SHOWN, _MOST_GRID = 1000, 24 * 3600 * FPS
+"""No source has so few frames, or so long a hole, unless one of its times is wrong: frames of the grid for each of
+its frames, and a day beside."""
 # Decoding and converting run beside encoding, as in ffmpeg itself.
 _FRAMES_AHEAD = 4
 _VIDEO_ID = re.compile(r"[A-Za-z0-9_-]+")
@@ -117,13 +120,17 @@ def plan_timeline(packet_times_s: np.ndarray, *, fps: int = FPS) -> Timeline:
         fps: frames per second of the grid.
 
     Raises:
-        VideoError: no times, or times that are not finite.
+        VideoError: no times, times that are not finite, or so far apart that one must be wrong.
     """
     times = np.unique(np.asarray(packet_times_s, dtype=np.float64))
     if len(times) == 0 or not np.isfinite(times).all():
         raise VideoError(f"a timeline needs finite presentation times, got {len(times)}; read the index again")
     t0 = float(times[0])
     count = math.floor((float(times[-1]) - t0) * fps + _TIE_S * fps) + 1
+    if count > len(times) * _MOST_SHOWN + _MOST_GRID:
+        raise VideoError(
+            f"{len(times)} source frames span {float(times[-1]) - t0:.0f} s: a timestamp is wild; remux the file"
+        )
     grid = t0 + np.arange(count) / fps
     after = np.searchsorted(times, grid - _TIE_S).clip(0, len(times) - 1)
     before = np.maximum(after - 1, 0)

@@ -140,11 +140,13 @@ def read_packet_times(path: Path) -> PacketTimes:
     """Every frame's presentation time, without decoding one.
 
     Raises:
-        VideoError: as ``probe``, or packets that carry no presentation times.
+        VideoError: as ``probe``, or packets that carry no presentation times, or times that start again: recordings
+            joined into one file, of which all but one would be lost.
     """
     path = Path(path)
     times: dict[float, bool] = {}
     broken = untimed = 0
+    newest_key_s = -math.inf
     with open_video(path) as container:
         stream = pick_video_stream(container, path)
         for packet in read_packets(container, stream):
@@ -154,7 +156,14 @@ def read_packet_times(path: Path) -> PacketTimes:
                 if packet.pts is None:
                     untimed += 1
                 else:
-                    times[seconds(packet.pts, packet.time_base)] = packet.is_keyframe
+                    time_s = seconds(packet.pts, packet.time_base)
+                    if packet.is_keyframe and time_s < newest_key_s - HOLE_S:
+                        raise VideoError(
+                            f"{path}: timestamps start again at {time_s:.3f} s after {newest_key_s:.3f} s: recordings "
+                            "were joined as they were; give them one by one, or remux them into one timeline"
+                        )
+                    newest_key_s = max(newest_key_s, time_s) if packet.is_keyframe else newest_key_s
+                    times[time_s] = packet.is_keyframe
         if is_cut_off(path):
             broken = max(broken, stream.frames - len(times) - untimed)
     if untimed > len(times):
@@ -263,10 +272,13 @@ def frame_count(path: Path) -> int:
     """How many frames a file's index lists.
 
     Raises:
-        VideoError: as ``probe``.
+        VideoError: as ``probe``, or a container that lists none, such as Matroska.
     """
     with open_video(Path(path)) as container:
-        return pick_video_stream(container, Path(path)).frames
+        count = pick_video_stream(container, Path(path)).frames
+    if not count:
+        raise VideoError(f"{path}: its container lists no frames; remux it: ffmpeg -i IN -c copy OUT.mp4")
+    return count
 
 
 def _rgb_converter(info: VideoInfo, picture: PictureMap | None) -> FrameConverter:

@@ -21,7 +21,8 @@ from dataset.tables import COUNTS_SCHEMA, VideoIndex, read_index, read_table, ta
 from labeling.detection import Detector
 from labeling.errors import ConfigError, DataError, VideoError
 from labeling.extractors import ExtractorChoice, choose_extractors
-from labeling.model_cards import file_sha256, find_weights, load_cards
+from labeling.model_cards import find_weights, load_cards
+from labeling.onnx_files import weights_sha256
 from labeling.timeline import ClipPlan, ClipSettings, Timeline, plan_clips, plan_timeline
 from labeling.video import decode_at
 from pipelines.config import PictureSettings, SelectSettings, parse_settings
@@ -45,7 +46,7 @@ def weights_hashes(job: Job, names: list[str]) -> dict[str, str]:
     """sha256 of each card's weights as they lie there, by card name."""
     cards = load_cards(job.models_dir)
     found = {name: find_weights(cards[name], job.models_dir) for name in names}
-    return {name: file_sha256(path) for name, path in sorted(found.items()) if path is not None}
+    return {name: weights_sha256(path) for name, path in sorted(found.items()) if path is not None}
 
 
 class CountStage:

@@ -7,9 +7,18 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from labeling.model_cards import ModelCard
+from labeling.model_cards import ModelCard, SimccCard
 
 Batch = int | str | None
+
+
+def simcc_card(**changes: object) -> SimccCard:
+    """The card of ``random_simcc``'s head for 17 joints."""
+    values = {
+        "name": "head", "file": "head.onnx", "schema": "coco17", "input_width": 64, "input_height": 96,
+        "licence": "none", "source": "make it with a test", **changes,
+    }  # fmt: skip
+    return SimccCard.model_validate(values)
 
 
 def save_graph(

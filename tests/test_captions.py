@@ -120,9 +120,10 @@ def test_tables_of_every_kind_give_the_same_texts(tmp_path, name):
         ([ROWS[0], {"key": "", "text": "x"}], "row 2 has key '' and text 'x'"),
         ([ROWS[0], {"key": "c_0", "text": "  "}], "row 2 has key 'c_0'"),
         ([ROWS[0], ROWS[0]], "row 2 repeats the key 'a_0'"),
+        ([ROWS[0], ROWS[0] | {"key": " a_0 "}], "row 2 repeats the key 'a_0'"),
         ([], "holds no captions"),
     ],
-    ids=["column", "key", "text", "repeated", "empty"],
+    ids=["column", "key", "text", "repeated", "repeated with spaces", "empty"],
 )
 def test_a_table_that_cannot_be_used_says_where(tmp_path, name, rows, message):
     with pytest.raises(DataError, match="captions") as caught:
@@ -152,6 +153,14 @@ def test_a_missing_table_is_a_clear_error(tmp_path):
     for name in ("none.csv", "none.parquet", "none.jsonl"):
         with pytest.raises(DataError, match="check the path"):
             read_caption_table(tmp_path / name)
+
+
+def test_json_lines_may_hold_any_text_and_begin_with_a_mark(tmp_path):
+    """U+2028 and U+0085 end a line for Unicode, but not for JSON; editors on Windows put a mark before the first."""
+    text = "a road\u2028with cars\u0085and people"
+    row = json.dumps({"key": "a_0", "text": text}, ensure_ascii=False)
+    (tmp_path / "c.jsonl").write_text(f"\ufeff{row}\r\n\r\n", encoding="utf-8", newline="")
+    assert read_caption_table(tmp_path / "c.jsonl") == {"a_0": text}
 
 
 @pytest.mark.parametrize("line", ['["a_0", "text"]', '{"key": 5, "text": "x"}', "3"])

@@ -9,13 +9,14 @@ import onnx
 import onnx_fixtures
 import pytest
 from onnx import TensorProto, helper
+from onnx_fixtures import simcc_card
 from pydantic import ValidationError
 
 from labeling.errors import ModelError
 from labeling.model_cards import (
     CifcafCard,
-    SimccCard,
     YoloxCard,
+    file_sha256,
     find_weights,
     load_cards,
     read_card,
@@ -24,16 +25,8 @@ from labeling.model_cards import (
     weights_without_card,
     write_card,
 )
-from labeling.onnx_files import check_external_data, check_file
+from labeling.onnx_files import check_external_data, check_file, weights_sha256
 from labeling.onnx_model import OnnxModel, network_input, resolve_providers
-
-
-def simcc_card(**changes: object) -> SimccCard:
-    values = {
-        "name": "head", "file": "head.onnx", "schema": "coco17", "input_width": 64, "input_height": 96,
-        "licence": "none", "source": "make it with a test", **changes,
-    }  # fmt: skip
-    return SimccCard.model_validate(values)
 
 
 @pytest.fixture
@@ -301,6 +294,18 @@ class TestExternalData:
         (tmp_path / "weights.bin").write_bytes(bytes(256))
         check_external_data(path)
         assert onnx.load(str(path)).graph.node
+
+    def test_a_hash_covers_the_weights_wherever_they_lie(self, tmp_path: Path) -> None:
+        (tmp_path / "weights.bin").write_bytes(bytes(256))
+        path = external_model(tmp_path, "weights.bin")
+        before = weights_sha256(path)
+        assert before != file_sha256(path)
+        (tmp_path / "weights.bin").write_bytes(bytes(255) + b"x")
+        os.utime(tmp_path / "weights.bin", ns=(1, 1))
+        assert weights_sha256(path) != before
+        card = simcc_card(file="model.onnx", sha256=file_sha256(path))
+        with pytest.raises(ModelError, match=r"weights\.bin, which its card's sha256 does not cover"):
+            check_file(card, path)
 
 
 def test_the_network_sees_the_channels_and_numbers_that_the_card_says() -> None:

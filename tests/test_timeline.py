@@ -19,6 +19,7 @@ from video_fixtures import (
     read_code,
     read_patches,
     regular_times,
+    retimed,
     variable_times,
     with_garbage,
     write_source,
@@ -351,6 +352,32 @@ def test_a_file_without_its_end_keeps_what_is_there(tmp_path: Path) -> None:
     assert [i for i, code in enumerate(shown) if code != i and not frames.hole[i]] == []
     first = int(np.argmax(frames.hole)) if frames.hole.any() else len(shown)
     assert frames.hole[first:].all() and len(shown) - first < 24
+
+
+def test_a_time_that_comes_twice_costs_no_frame(tmp_path: Path) -> None:
+    """Matroska may hold two frames at one time: the first is shown, and nothing after it is late."""
+    plain = write_source(tmp_path / "plain.mkv", regular_times(24, 30), SourceSpec(b_frames=0, container="matroska"))
+    source = retimed(plain, tmp_path / "twice.mkv", lambda place: -(-(place - (place > 12)) * 1000 // 24))
+    timeline = planned(source)
+    assert len(timeline) == 29
+    out = tmp_path / "run.mp4"
+    cut_run(source, timeline, Span(start=0, end=29), out, picture=cover_map(128, 96, **SIZE))
+    shown = [read_code(frame) for frame in read_frames(out)]
+    assert shown == [*range(13), *range(14, 30)]
+
+
+def test_recordings_joined_as_they_were_are_refused(tmp_path: Path) -> None:
+    """Their times begin again, so that all but one of them would be lost in silence."""
+    spec = SourceSpec(b_frames=0, container="mpegts")
+    parts = [write_source(tmp_path / f"{n}.ts", regular_times(24, 48), spec).read_bytes() for n in range(2)]
+    (tmp_path / "both.ts").write_bytes(b"".join(parts))
+    with pytest.raises(VideoError, match="timestamps start again"):
+        read_packet_times(tmp_path / "both.ts")
+
+
+def test_a_wild_time_is_refused_before_it_takes_the_memory() -> None:
+    with pytest.raises(VideoError, match="a timestamp is wild"):
+        plan_timeline(np.array([0.0, 0.04, 2.0**35]))
 
 
 def test_a_hard_cut_is_found_and_drops_only_clips_that_contain_it(tmp_path: Path) -> None:

@@ -219,6 +219,24 @@ def test_frames_by_index_and_the_same_bytes_again(tmp_path: Path, settings: Enco
         next(read_frames(tmp_path / "a.mp4", start=50, end=61))
 
 
+def test_a_container_that_lists_no_frames_is_refused(tmp_path: Path) -> None:
+    source = write_source(tmp_path / "a.mkv", regular_times(24, 8), SourceSpec(container="matroska"))
+    with pytest.raises(VideoError, match="lists no frames; remux it"):
+        list(read_frames(source))
+
+
+def test_a_video_of_no_frames_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(VideoError, match="not one frame"), VideoWriter(tmp_path / "a.mp4", width=64, height=64):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_copying_from_what_is_no_video_says_so(tmp_path: Path) -> None:
+    (tmp_path / "run.mp4").write_bytes(b"no video")
+    with pytest.raises(VideoError, match=r"run\.mp4"):
+        copy_packets(tmp_path / "run.mp4", tmp_path / "clip.mp4", start=0, end=5)
+
+
 def test_wrong_frames_and_settings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="even"):
         VideoWriter(tmp_path / "odd.mp4", width=95, height=64)

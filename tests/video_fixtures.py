@@ -223,3 +223,16 @@ def with_garbage(source: Path, out: Path, *, first: int, last: int, seed: int = 
         data[packet.pos : packet.pos + packet.size] = noise
     out.write_bytes(data)
     return out
+
+
+def retimed(source: Path, out: Path, time_of: Callable[[int], int]) -> Path:
+    """The file's packets, by ``time_of`` their place, at other times (both decoding and presentation, milliseconds)."""
+    with av.open(str(source)) as container, av.open(str(out), "w") as target:
+        template = container.streams.video[0]
+        stream = target.add_stream_from_template(template)
+        for place, packet in enumerate(packet for packet in container.demux(template) if packet.size):
+            packet.time_base = Fraction(1, 1000)
+            packet.pts = packet.dts = time_of(place)
+            packet.stream = stream
+            target.mux(packet)
+    return out
