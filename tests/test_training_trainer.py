@@ -20,6 +20,7 @@ from training.config import TrainConfig
 from training.guards import TrainingError, memory_advice, memory_knobs
 from training.latents import open_store
 from training.run_log import RunLog, read_metrics
+from training.run_state import RunState, read_state
 from training.trainer import Trainer, TrainSummary, train
 
 
@@ -123,6 +124,25 @@ def test_1_2_and_4_processes_have_the_same_losses(tiny_job: Path, tmp_path: Path
         losses[count] = found[0]
     assert losses[2] == pytest.approx(losses[1], rel=1e-5)
     assert losses[4] == pytest.approx(losses[1], rel=1e-5)
+
+
+def test_a_resume_with_unequal_shares_equals_an_undisturbed_run(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    """Three samples a step over two processes: one of them has two micro-batches, the other one."""
+    config = tiny_config(
+        "motion", optimiser={"steps": 5, "global_batch": 3, "micro_batch": 1}, checkpoint={"every_steps": 2, "keep": 9}
+    )
+    whole = in_children(2, lambda _: list(run(config, tiny_job, tmp_path / "whole").losses))
+    checkpoint = tmp_path / "whole" / "checkpoints" / "step_00000002"
+    rest = in_children(2, lambda _: list(run(config, tiny_job, tmp_path / "rest", resume=checkpoint).losses))
+    assert rest == [whole[0][2:]] * 2
+    last = "checkpoints/step_00000005"
+    assert files_of(tmp_path / "whole" / last) == files_of(tmp_path / "rest" / last)
+
+
+def test_states_of_older_checkpoints_are_read(tmp_path: Path) -> None:
+    older = {"step": 7, "config": {"seed": 1}, "loader": {"yielded": 9}, "loader_start": 0, "layout": {"workers": 2}}
+    (tmp_path / "state.json").write_text(json.dumps(older))
+    assert read_state(tmp_path) == RunState(step=7, config={"seed": 1})
 
 
 def test_accumulation_changes_nothing_but_rounding(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
@@ -406,8 +426,8 @@ def test_bfloat16_base_trains_float32_adapters(tmp_path: Path) -> None:
     assert losses[-1] < losses[0]
 
 
-def test_fetching_ahead_keeps_order_state_and_errors() -> None:
-    from torchdata.stateful_dataloader import StatefulDataLoader
+def test_fetching_ahead_keeps_order_and_errors() -> None:
+    from torch.utils.data import DataLoader
 
     from training.prefetch import Prefetched
 
@@ -422,16 +442,13 @@ def test_fetching_ahead_keeps_order_state_and_errors() -> None:
         def __len__(self) -> int:
             return 7
 
-    def loader() -> StatefulDataLoader:
-        batches = StepBatches(7, config=config)
-        return StatefulDataLoader(Numbers(), batch_sampler=batches, collate_fn=lambda items: items[0])
+    def loader(start_step: int = 0) -> DataLoader:
+        batches = StepBatches(7, config=config, start_step=start_step)
+        return DataLoader(Numbers(), batch_sampler=batches, collate_fn=lambda items: items[0])
 
     with Prefetched(loader()) as ahead:
         seen = [next(ahead) for _ in range(4)]
-        state = ahead.state
-    again = loader()
-    again.load_state_dict(state)
-    with Prefetched(again) as rest:
+    with Prefetched(loader(2)) as rest:
         seen += [next(rest) for _ in range(6)]
         assert [step for step, _ in seen] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
         with pytest.raises(DataError, match="damaged"):

@@ -59,7 +59,7 @@ class TrainingBatch:
 class StepBatches:
     """An iterable of micro-batches of ``Draw``, this process's share of each step from ``start_step`` on.
 
-    It is a stateful batch sampler for torchdata's ``StatefulDataLoader``.
+    It is a batch sampler for torch's ``DataLoader``.
     """
 
     def __init__(
@@ -71,7 +71,6 @@ class StepBatches:
         self._global_batch, self._micro_batch = config.optimiser.global_batch, config.optimiser.micro_batch
         self._rank, self._world_size = rank, world_size
         self._steps, self._start_step = config.optimiser.steps, start_step
-        self._yielded = 0
 
     @property
     def per_step(self) -> int:
@@ -82,13 +81,10 @@ class StepBatches:
         return (self._steps - self._start_step) * self.per_step
 
     def __iter__(self) -> Iterator[list[Draw]]:
-        skip, self._yielded = self._yielded, 0
         for step in range(self._start_step, self._steps):
             mine = self.step_draws(step)[self._rank :: self._world_size]
             for start in range(0, len(mine), self._micro_batch):
-                self._yielded += 1
-                if self._yielded > skip:
-                    yield mine[start : start + self._micro_batch]
+                yield mine[start : start + self._micro_batch]
 
     def step_draws(self, step: int) -> list[Draw]:
         """The whole step's draws, over all processes."""
@@ -103,14 +99,6 @@ class StepBatches:
         if cached is None or cached[0] != epoch:
             self._cached = cached = (epoch, np.random.default_rng([self._seed, epoch]).permutation(self._count))
         return cached[1]
-
-    def state_dict(self) -> dict[str, int]:
-        """How far it got."""
-        return {"yielded": self._yielded}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on from there."""
-        self._yielded = state["yielded"]
 
 
 class TrainingItems(Dataset):

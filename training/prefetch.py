@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from torchdata.stateful_dataloader import StatefulDataLoader
+from torch.utils.data import DataLoader
 
 _LOOK_S = 0.1
 """How often a waiting thread looks whether the other one still lives."""
@@ -19,24 +19,19 @@ _LEAVE_S = 10.0
 class Prefetched:
     """A loader's batches, fetched ahead by a thread; a context manager, entered by the thread that takes the batches.
 
-    The loader runs ahead of what was handed out, so its state is noted with each batch: ``state`` is as of the last
-    batch handed out, and a resume loses none of those that were fetched but not used.
-
     Args:
         loader: iterated once.
         depth: batches that wait at most.
     """
 
-    def __init__(self, loader: StatefulDataLoader, *, depth: int = 4) -> None:
+    def __init__(self, loader: DataLoader, *, depth: int = 4) -> None:
         self._loader = loader
-        self._ready: queue.Queue[tuple[str, Any, dict[str, Any]]] = queue.Queue(maxsize=depth)
+        self._ready: queue.Queue[tuple[str, Any]] = queue.Queue(maxsize=depth)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._fetch, name="prefetch", daemon=True)
-        self.state: dict[str, Any] = {}
 
     def __enter__(self) -> "Prefetched":
         # Workers are forked here, before there is a second thread whose locks they could inherit.
-        self.state = self._loader.state_dict()
         self._batches = iter(self._loader)
         self._thread.start()
         return self
@@ -54,27 +49,26 @@ class Prefetched:
     def _fetch(self) -> None:
         try:
             for batch in self._batches:
-                self._ready.put(("batch", batch, self._loader.state_dict()))
+                self._ready.put(("batch", batch))
                 if self._closed.is_set():
                     return
-            self._ready.put(("end", None, {}))
+            self._ready.put(("end", None))
         except BaseException as error:
             # It belongs to whoever waits for the batch.
-            self._ready.put(("error", error, {}))
+            self._ready.put(("error", error))
 
     def __iter__(self) -> Iterator[Any]:
         return self
 
     def __next__(self) -> Any:
-        kind, content, state = self._take()
+        kind, content = self._take()
         if kind == "error":
             raise content
         if kind == "end":
             raise StopIteration
-        self.state = state
         return content
 
-    def _take(self) -> tuple[str, Any, dict[str, Any]]:
+    def _take(self) -> tuple[str, Any]:
         while True:
             # Looked at before the queue: what a thread puts just before it ends is not lost.
             running = self._thread.is_alive()
@@ -82,7 +76,7 @@ class Prefetched:
                 return self._ready.get(timeout=_LOOK_S if running else 0.001)
             except queue.Empty:
                 if not running:
-                    return "end", None, {}
+                    return "end", None
 
 
 def leave_signals_to_the_trainer(_worker: int = 0) -> None:

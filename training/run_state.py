@@ -1,4 +1,4 @@
-"""A run's state as checkpoint files: adapter, optimiser moments, and the step with the data order, all plain data."""
+"""A run's state as checkpoint files: adapter, optimiser moments, and the step with its settings, all plain data."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -19,16 +19,10 @@ _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunState:
-    """Where a run stands. The learning rate and every draw follow from the step, so there is no more."""
+    """Where a run stands. Learning rate, order and every draw follow from the step, so there is no more."""
 
     step: int
     """Optimiser steps done."""
-    loader: dict[str, Any]
-    """``StatefulDataLoader``'s state."""
-    loader_start: int
-    """The step that the loader's order began at."""
-    layout: dict[str, int]
-    """Processes, workers, micro-batch, global batch: the loader's state holds for the same ones only."""
     config: dict[str, Any]
 
 
@@ -43,7 +37,7 @@ def pack_state(
         optimiser: over the parameters ``names``, in one group.
         names: of the parameters, in the optimiser's order.
         config: the run's.
-        state: step and data order.
+        state: the step.
         frames: video frames per clip that it was trained on.
         prefix: of the adapter's keys.
     """
@@ -51,13 +45,7 @@ def pack_state(
     return {
         ADAPTER: adapter_bytes(denoiser, config.stage, config.adapter, about=about, prefix=prefix),
         OPTIMISER: _moments(optimiser, names),
-        STATE: json.dumps(
-            {
-                "step": state.step, "loader": state.loader, "loader_start": state.loader_start,
-                "layout": state.layout, "config": state.config,
-            },
-            sort_keys=True,
-        ).encode(),
+        STATE: json.dumps({"step": state.step, "config": state.config}, sort_keys=True).encode(),
     }  # fmt: skip
 
 
@@ -78,8 +66,10 @@ def read_state(checkpoint: Path) -> RunState:
         DataError: it is not what this version writes.
     """
     try:
-        return RunState(**json.loads((checkpoint / STATE).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
+        tree = json.loads((checkpoint / STATE).read_text(encoding="utf-8"))
+        # Older checkpoints hold how far a loader got as well, which is not needed.
+        return RunState(step=tree["step"], config=tree["config"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{checkpoint / STATE} is no run state ({error}); start afresh with --resume never") from error
 
 

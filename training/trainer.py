@@ -6,7 +6,6 @@ Hutter 2019). Nothing random is carried from step to step, so a checkpoint is th
 """
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ import torch
 from accelerate import Accelerator
 from accelerate.tracking import get_available_trackers
 from accelerate.utils import LoggerType
-from torchdata.stateful_dataloader import StatefulDataLoader
+from torch.utils.data import DataLoader
 
 from dataset.receipts import storage_errors
 from labeling.errors import ConfigError, DataError
@@ -122,14 +121,15 @@ class Trainer:
         self.draws_inside = any(
             isinstance(one, torch.nn.Dropout) and one.p > 0 for one in self.backbone.denoiser.modules()
         )
-        self.step = 0
-        self.loader, self.loader_start = self._resume(resume)
+        self.step = self._resume(resume)
+        self.loader = self._loader(self.step)
 
-    def _resume(self, resume: Resume) -> tuple[StatefulDataLoader, int]:
+    def _resume(self, resume: Resume) -> int:
+        """Steps done, with the adapter and the moments put back."""
         root = self.out / "checkpoints"
         checkpoint = newest_checkpoint(root) if isinstance(resume, str) else resume
         if checkpoint is None:
-            return self._loader(0), 0
+            return 0
         if resume == "never":
             raise ConfigError(f"{self.out} already has checkpoints; give another --out, or --resume auto to go on")
         check_checkpoint(checkpoint)
@@ -141,36 +141,22 @@ class Trainer:
                 "another --out"
             )
         restore(checkpoint, self.backbone.denoiser, self.optimiser, self.names, adapter=self.config.stage)
-        self.step = state.step
-        if state.layout == self._layout():
-            loader = self._loader(state.loader_start)
-            loader.load_state_dict(state.loader)
-            return loader, state.loader_start
-        return self._loader(state.step), state.step
+        return state.step
 
-    def _layout(self) -> dict[str, int]:
-        optimiser = self.config.optimiser
-        return {
-            "processes": self.accelerator.num_processes, "workers": self.config.loader_workers,
-            "micro_batch": optimiser.micro_batch, "global_batch": optimiser.global_batch, "clips": len(self.keys),
-        }  # fmt: skip
-
-    def _loader(self, start_step: int) -> StatefulDataLoader:
+    def _loader(self, start_step: int) -> DataLoader:
+        # The order is a function of the step alone: how far a loader got differs from process to process.
         self.batches = StepBatches(
             len(self.keys), config=self.config, rank=self.accelerator.process_index,
             world_size=self.accelerator.num_processes, start_step=start_step,
         )  # fmt: skip
         workers = self.config.loader_workers
-        with warnings.catch_warnings():
-            # torchdata 0.11 calls a torch function that torch 2.13 has deprecated.
-            warnings.filterwarnings("ignore", message="'set_vital' is deprecated")
-            return StatefulDataLoader(
-                self.items, batch_sampler=self.batches, collate_fn=collate, num_workers=workers,
-                prefetch_factor=4 if workers else None,
-                worker_init_fn=leave_signals_to_the_trainer if workers else None,
-                # Else its state would hold a number drawn from the process's own generator.
-                generator=torch.Generator().manual_seed(keyed_seed(self.config.seed, "loader")),
-            )  # fmt: skip
+        return DataLoader(
+            self.items, batch_sampler=self.batches, collate_fn=collate, num_workers=workers,
+            prefetch_factor=4 if workers else None,
+            worker_init_fn=leave_signals_to_the_trainer if workers else None,
+            # Else it would draw a number from the process's own generator.
+            generator=torch.Generator().manual_seed(keyed_seed(self.config.seed, "loader")),
+        )  # fmt: skip
 
     def run(self, on_step: Callable[[int, float], None] | None = None) -> TrainSummary:
         """Train to the last step, or until Ctrl-C."""
@@ -260,10 +246,7 @@ class Trainer:
     def _save(self) -> None:
         if not self.accelerator.is_main_process:
             return
-        state = RunState(
-            step=self.step, loader=self.micro_batches.state, loader_start=self.loader_start, layout=self._layout(),
-            config=self.config.model_dump(mode="json"),
-        )  # fmt: skip
+        state = RunState(step=self.step, config=self.config.model_dump(mode="json"))
         files = pack_state(
             self.backbone.denoiser, self.optimiser, self.names, config=self.config, state=state,
             frames=self.store.manifest.frames, prefix=self.backbone.adapter_prefix,

@@ -192,7 +192,7 @@ def big_sample_ms(folder: Path) -> float:
 
 def waiting_percent(folder: Path, *, step_s: float = 0.2, steps: int = 40) -> dict[str, float]:
     """Share of wall time that steps of ``step_s`` wait for two loader workers, at the real sizes, in percent."""
-    from torchdata.stateful_dataloader import StatefulDataLoader
+    from torch.utils.data import DataLoader
 
     from training.latent_store import LatentStore
 
@@ -201,7 +201,7 @@ def waiting_percent(folder: Path, *, step_s: float = 0.2, steps: int = 40) -> di
         conditions={"ego_probability": 1.0, "objects_probability": 1.0},
     )  # fmt: skip
     items = TrainingItems(LatentStore(folder / "big"), [f"v_{index}" for index in range(8)], config)
-    loader = StatefulDataLoader(
+    loader = DataLoader(
         items, batch_sampler=StepBatches(8, config=config), collate_fn=collate, num_workers=2, prefetch_factor=4
     )
     waits = []
