@@ -61,8 +61,9 @@ def run_cache(
             job, backbone_name=backbone, part=(share.index - 1, share.count) if share else (0, 1), progress=show,
             object_variants=object_variants, device=device, refresh=refresh, picture=picture, controls=controls,
         )  # fmt: skip
+    gone = f"{summary.retired} are in the shards no longer, " if summary.retired else ""
     make_console().print(
-        f"{summary.made} clips encoded, {summary.kept} were there, {summary.captions} captions, "
+        f"{summary.made} clips encoded, {summary.kept} were there, {gone}{summary.captions} captions, "
         f"{file_size(summary.bytes)} in {summary.folder}"
     )
     return summary

@@ -98,6 +98,39 @@ def test_a_stopped_run_goes_on_and_ends_the_same(tmp_path: Path, backbone, tiny_
     assert cache(tmp_path, backbone).made == 0
 
 
+def clips(*keys: str) -> list[FakeSample]:
+    return [FakeSample(key=key) for key in keys]
+
+
+def test_clips_that_left_the_shards_are_retired_and_come_back_without_work(tmp_path: Path, backbone) -> None:
+    every = {"train": clips("a_0", "b_0", "c_0"), "val": clips("d_0")}
+    cache(tmp_path, backbone, datasets=every)
+    fewer = {"train": clips("a_0"), "val": clips("d_0")}
+    # Of two hosts, either may come first, and both say the same of clips that are not theirs.
+    summaries = [cache(tmp_path, backbone, datasets=fewer, part=(index, 2)) for index in (1, 0)]
+    assert [(one.made, one.retired) for one in summaries] == [(0, 2), (0, 0)]
+    store = LatentStore(tmp_path / "latents" / "tiny")
+    assert (store.keys("train"), store.keys("val")) == (["a_0"], ["d_0"])
+    with pytest.raises(DataError, match="no latents of clip b_0"):
+        store.record("b_0")
+    assert cache(tmp_path, backbone, datasets=every).made == 0
+    assert LatentStore(store.folder).keys("train") == ["a_0", "b_0", "c_0"]
+
+
+def test_the_newest_split_holds_whatever_the_number_of_parts(tmp_path: Path, backbone) -> None:
+    old = {"train": clips("a_0", "b_0", "c_0"), "val": clips("d_0")}
+    for index in (0, 1):
+        cache(tmp_path, backbone, datasets=old, part=(index, 2))
+    new = {"train": clips("b_0", "c_0", "d_0"), "val": clips("a_0")}
+    folder = tmp_path / "latents" / "tiny"
+    for _ in range(2):
+        assert cache(tmp_path, backbone, datasets=new).made == 0
+        store = LatentStore(folder)
+        assert (store.keys("train"), store.keys("val")) == (["b_0", "c_0", "d_0"], ["a_0"])
+    lines = [line for log in folder.glob("clips-*.jsonl") for line in log.read_text().splitlines()]
+    assert len(lines) == 6, "a run that changes nothing writes nothing"
+
+
 def test_a_damaged_clip_and_a_changed_source_are_made_anew(tmp_path: Path, backbone, monkeypatch) -> None:
     few = {"datasets": fake_datasets(1, 1)}
     cache(tmp_path, backbone, **few)

@@ -1,7 +1,7 @@
 """A folder of cached latents and how it is read: one safetensors file per clip, text embeddings once per caption.
 
 latents/<backbone>/cache.json             fingerprint, its parts, sizes
-                   clips-<i>of<n>.jsonl   one line per finished clip, appended by part i
+                   clips-<i>of<n>.jsonl   one line per finished or retired clip, appended by part i
                    clips/<video>/<key>.safetensors   rgb image skeleton ego objects_<v> <control>, mask_<control>
                    text/<xx>/<sha256 of the caption>.safetensors
 """
@@ -39,6 +39,10 @@ class ClipRecord:
     source: str
     """sha256 over what the clip was made from."""
     object_variants: int = 1
+    turn: int = 0
+    """Counts a clip's records over all parts: the one with the highest turn holds."""
+    retired: bool = False
+    """The clip left the shards: its file may lie there still, but it is not offered."""
 
     def line(self) -> str:
         """As one line of JSON."""
@@ -112,7 +116,7 @@ class LatentStore:
         if manifest is None:
             raise DataError(f"{self.folder} holds no latents; make them with `animatic cache JOB --backbone NAME`")
         self.manifest = manifest
-        self._records = {record.key: record for record in read_records(self.folder)}
+        self._records = {record.key: record for record in read_records(self.folder) if not record.retired}
 
     @property
     def fps(self) -> float:
@@ -188,11 +192,16 @@ def text_path(folder: Path, caption: str) -> Path:
 
 
 def read_records(folder: Path) -> Sequence[ClipRecord]:
-    """The records of all parts; a later line replaces an earlier one, a torn last line is ignored."""
+    """The newest record of each clip over all parts, retired ones too; a torn last line is ignored.
+
+    Turns tell which is newest, not the order of files: a clip's part changes with the number of parts.
+    """
     latest: dict[str, ClipRecord] = {}
     for path in sorted(folder.glob("clips-*.jsonl")):
         *whole, _torn = path.read_text(encoding="utf-8").split("\n")
         for line in whole:
             record = ClipRecord(**json.loads(line))
-            latest[record.key] = record
+            known = latest.get(record.key)
+            if known is None or record.turn >= known.turn:
+                latest[record.key] = record
     return [latest[key] for key in sorted(latest)]

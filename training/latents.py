@@ -2,14 +2,15 @@
 
 Skeletons are rasterised afresh from keypoints and object and ego videos from tracks and trajectories, since a decoded
 4:2:0 video has lost their colours; only RGB (and controls that have no labels) are decoded. The mask for targeted noise
-comes from the same keypoints. A clip is done when its line is in the part's log; a killed job goes on from there.
+comes from the same keypoints. A clip is done when its line is in the part's log; a killed job goes on from there. Clips
+that left the shards are retired: every part says so in its own log, so that no host waits for another.
 """
 
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,8 @@ class CacheSummary:
     """Clips encoded now."""
     kept: int
     """Clips that were there already."""
+    retired: int
+    """Clips of the store that are in the shards no longer, and are not offered from now on."""
     captions: int
     """Distinct captions of this part."""
     fingerprint: str
@@ -112,8 +115,8 @@ def cache_latents(
         _open_store(folder, manifest, refresh=refresh)
         mine = [(split, one) for split, one in samples if int(hashed_share("part", one.key) * part[1]) == part[0]]
         return _cache_part(
-            folder, mine, backbone, manifest, part=part, controls=controls, object_variants=object_variants,
-            progress=progress,
+            folder, mine, backbone, manifest, present={one.key for _, one in samples}, part=part, controls=controls,
+            object_variants=object_variants, progress=progress,
         )  # fmt: skip
 
 
@@ -158,29 +161,38 @@ def _open_store(folder: Path, manifest: CacheManifest, *, refresh: bool) -> None
 
 def _cache_part(
     folder: Path, samples: Sequence[tuple[str, Any]], backbone: Backbone, manifest: CacheManifest, *,
-    part: tuple[int, int], controls: Sequence[str], object_variants: int, progress: Progress | None,
+    present: Set[str], part: tuple[int, int], controls: Sequence[str], object_variants: int, progress: Progress | None,
 ) -> CacheSummary:  # fmt: skip
     held = {record.key: record for record in read_records(folder)}
     log = folder / f"clips-{part[0]}of{part[1]}.jsonl"
     _cut_torn_line(log)
+    gone = [record for key, record in held.items() if key not in present and not record.retired]
+    for record in gone:
+        _append_line(log, replace(record, retired=True, turn=record.turn + 1).line())
     made, total_bytes, captions = 0, 0, {""}
     _cache_texts(folder, [""], backbone)
     for done, (split, sample) in enumerate(samples, start=1):
         source = _source_digest(sample)
         record = held.get(sample.key)
-        if not (record and _is_whole(folder, record, source=source, split=split)):
+        turn = record.turn + 1 if record else 1
+        if not (record and _is_whole(folder, record, source=source)):
             tensors = encode_clip(sample, backbone, manifest, controls=controls, object_variants=object_variants)
-            record = _write_clip(folder, tensors, sample, split=split, source=source, object_variants=object_variants)
+            made_now = _write_clip(folder, tensors, sample, split=split, source=source, object_variants=object_variants)
+            record = replace(made_now, turn=turn)
             made += 1
             _cache_texts(folder, [record.caption], backbone)
+            _append_line(log, record.line())
+        elif (record.split, record.retired) != (split, False):
+            # Its latents are the same in either split, and when it comes back.
+            record = replace(record, split=split, retired=False, turn=turn)
             _append_line(log, record.line())
         captions.add(record.caption)
         total_bytes += record.size
         if progress:
             progress(done, len(samples))
     return CacheSummary(
-        folder=folder, made=made, kept=len(samples) - made, captions=len(captions) - 1, bytes=total_bytes,
-        fingerprint=manifest.fingerprint,
+        folder=folder, made=made, kept=len(samples) - made, retired=len(gone), captions=len(captions) - 1,
+        bytes=total_bytes, fingerprint=manifest.fingerprint,
     )  # fmt: skip
 
 
@@ -230,12 +242,10 @@ def _source_digest(sample: Any) -> str:
     return digest({suffix: member.sha256 for suffix, member in members.items()} if members else sample.key)
 
 
-def _is_whole(folder: Path, record: ClipRecord, *, source: str, split: str) -> bool:
+def _is_whole(folder: Path, record: ClipRecord, *, source: str) -> bool:
     path = folder / record.file
-    fresh = (record.source, record.split) == (source, split)
-    return (
-        fresh and path.is_file() and path.stat().st_size == record.size and text_path(folder, record.caption).is_file()
-    )
+    whole = path.is_file() and path.stat().st_size == record.size
+    return record.source == source and whole and text_path(folder, record.caption).is_file()
 
 
 def _write_clip(
