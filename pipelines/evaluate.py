@@ -21,12 +21,19 @@ from dataset.receipts import atomic_write, digest, sha256_file, storage_errors
 from labeling.camera import read_tum, resample
 from labeling.errors import ConfigError
 from labeling.extractors import Extractors, choose_extractors
-from pipelines.evaluate_notes import clip_notes, result_notes, ruler_notes
+from pipelines.evaluate_notes import clip_notes, record_notes, result_notes, ruler_notes
 from pipelines.evaluate_ruler import EvaluateOptions, Ruler, check_options, read_ruler
 from training.evaluation import ClipTruth, SampleEstimate, score_clip, too_short, with_fault
 from training.evaluation_baselines import constant_velocity, held_first_frame
 from training.evaluation_estimates import ClipEstimator, clip_truth
-from training.evaluation_files import CONDITIONS, SampleFiles, SampleFolder, find_samples, video_size
+from training.evaluation_files import (
+    CONDITIONS,
+    SampleFiles,
+    SampleFolder,
+    find_samples,
+    shown_frames,
+    video_size,
+)
 from training.evaluation_report import (
     FLOOR,
     HELD,
@@ -56,6 +63,8 @@ class _Task:
     files: Files
     asked: Path
     """Where the trajectory that was asked for would lie."""
+    shown: int | None
+    """Frames of the clip that the samples' conditions were made of, where a record tells."""
     ruler: Ruler
 
 
@@ -101,7 +110,10 @@ def evaluate(
     tasks = {}
     for key in keys:
         files = {name: folder.by_key.get(key, ()) for name, folder in folders.items()}
-        task = _Task(sample=clips[key], files=files, asked=samples / CONDITIONS / f"{key}.tum", ruler=ruler)
+        task = _Task(
+            sample=clips[key], files=files, asked=samples / CONDITIONS / f"{key}.tum",
+            shown=shown_frames(samples / f"{key}.json"), ruler=ruler,
+        )  # fmt: skip
         tasks[_stamp(task)] = task
     left = {stamp: task for stamp, task in tasks.items() if stamp not in kept}
     for stamp, result in _worked(left, workers=options.workers):
@@ -113,6 +125,7 @@ def evaluate(
     report = build_report(results)
     notes = (
         *clip_notes(splits, folders, options.samples_per_clip), *ruler_notes(ruler.choice, options.trajectories),
+        *record_notes(keys, [task.sample.key for task in tasks.values() if task.shown is None], ruler.choice),
         *result_notes(report, results, longest_s=_longest_s([clips[key] for key in keys])),
     )  # fmt: skip
     record = {
@@ -164,7 +177,7 @@ def _opened(cards: tuple[str, ...], models_dir: Path | None) -> Extractors | Non
 def _evaluate_clip(task: _Task) -> ClipResult:
     sample, ruler = task.sample, task.ruler
     condition = _asked_poses(task.asked, sample) if task.asked.is_file() else None
-    truth = clip_truth(sample, object_variant=ruler.object_variant, ego_condition=condition)
+    truth = clip_truth(sample, object_variant=ruler.object_variant, ego_condition=condition, shown=task.shown)
     extractors = _opened(tuple(card.name for card in ruler.choice.cards), ruler.models_dir)
     looker = ClipEstimator(sample, truth, extractors=extractors, settings=ruler.settings)
     sets: dict[str, list[SampleEstimate]] = {
@@ -213,7 +226,7 @@ def _stamp(task: _Task) -> str:
     members = {suffix: member.sha256 for suffix, member in task.sample.members.items()}
     wants = [one.wants_trajectory for these in task.files.values() for one in these]
     asked = sha256_file(task.asked) if task.asked.is_file() else ""
-    return digest([task.ruler.as_json(), paths, wants, members, asked])
+    return digest([task.ruler.as_json(), paths, wants, members, asked, task.shown])
 
 
 def _parts(files: SampleFiles) -> list[Path]:

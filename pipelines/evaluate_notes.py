@@ -51,6 +51,22 @@ def ruler_notes(choice: ExtractorChoice, trajectories: Path | None) -> list[str]
     return notes
 
 
+def record_notes(keys: Sequence[str], unrecorded: Sequence[str], choice: ExtractorChoice) -> list[str]:
+    """Which objects the samples are taken to have been given, where no record tells.
+
+    Args:
+        keys: of the clips that are judged.
+        unrecorded: those without a record.
+        choice: the extractors; without any, boxes are not judged.
+    """
+    if not unrecorded or not choice.cards:
+        return []
+    return [
+        f"{len(unrecorded)} of {len(keys)} clips have no record of what was generated (<key>.json), such as "
+        f"{unrecorded[0]}: their samples are taken to have been given the objects of the whole clip"
+    ]
+
+
 def result_notes(report: Report, results: Sequence[ClipResult], *, longest_s: float) -> list[str]:
     """How long the comparison is, in which geometry, and how far intervals can be trusted.
 

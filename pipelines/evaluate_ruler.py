@@ -11,7 +11,7 @@ from pipelines.config import EFFORTS
 from pipelines.job import open_job
 from training.evaluation_estimates import EstimateSettings
 
-_VERSION = 2
+_VERSION = 3
 """Counts changes of what is estimated or scored: results of another version are made anew."""
 
 

@@ -157,8 +157,8 @@ def _views(generator: ClipGenerator, sample: Sample, request: ClipsRequest) -> d
     if request.true_skeletons:
         views["skeleton_video"] = _skeletons(sample, generator.picture("appearance"), count)
     if request.object_variant is not None:
-        stage = "motion" if "motion" in generator.files else next(iter(generator.files))
-        views["objects"] = _objects(sample, generator.picture(stage), count, request.object_variant)
+        picture = generator.picture(generator.first_stage)
+        views["objects"] = _objects(sample, picture, count, request.object_variant)
     return views
 
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from pipeline_fixtures import run_all
+from training_fixtures import walker
 from typer.testing import CliRunner
 
 from dataset.loader import Sample, ShardDataset
@@ -19,15 +20,16 @@ from dataset.street import StreetConfig, write_street_video
 from labeling.camera import rebased_trajectory, write_tum
 from labeling.encoding import VideoWriter, lossless_rgb
 from labeling.errors import ConfigError, DataError, ModelError
+from labeling.object_video import chosen_tracks
 from pipelines.cli import app
 from pipelines.config import Config, merged
 from pipelines.evaluate import EvaluateOptions, Evaluation, evaluate
 from pipelines.evaluate_console import coverage_table, figure_table
-from pipelines.evaluate_notes import clip_notes, ruler_notes
+from pipelines.evaluate_notes import clip_notes, record_notes, ruler_notes
 from pipelines.generate_clips import ClipsRequest, chosen_clips, generate_clips
 from pipelines.job import Job, Source
-from training.evaluation_estimates import LEAST_CONFIDENCE, ego_fault
-from training.evaluation_files import SampleFolder, find_samples, sample_name, video_rate
+from training.evaluation_estimates import LEAST_CONFIDENCE, clip_truth, ego_fault
+from training.evaluation_files import SampleFolder, find_samples, sample_name, shown_frames, video_rate
 from training.evaluation_report import FLOOR, HELD, SAMPLES, TRUE_SKELETONS, VELOCITY
 
 WIDTH, HEIGHT, CLIP = 288, 192, 17
@@ -282,6 +284,31 @@ def test_the_first_samples_count_in_the_order_of_their_numbers(tmp_path: Path) -
     assert [one.number for one in folder.by_key["a_0"]] == [0, 1, 2, 3]
     assert (folder.beyond, folder.strangers) == (2, ())
     assert video_rate(np.arange(11) / 10) == pytest.approx(10) and video_rate([0.0]) == 0
+
+
+def test_objects_are_judged_by_the_tracks_that_the_samples_could_be_given(tmp_path: Path) -> None:
+    """Eight walkers in the first 49 frames, eight more after them: the generator saw every other of 25 frames."""
+    labels = [walker(frame, x=30, track_id=track) for track in range(1, 9) for frame in range(49)]
+    labels += [walker(frame, x=30, track_id=track) for track in range(9, 17) for frame in range(60, 121)]
+    sample: Any = SimpleNamespace(
+        key="v_0", meta={"video_id": "v", "fps": 24, "picture": {"width": 96, "height": 64}},
+        cam_to_world=np.tile(np.eye(4), (121, 1, 1)), keypoints=lambda: labels,
+    )  # fmt: skip
+    for record in ({"frame_step": 2}, {"backbone": {"picture": {"frame_step": 2}}}):
+        (tmp_path / "v_0.json").write_text(json.dumps({"frames": 25, **record}))
+        shown = shown_frames(tmp_path / "v_0.json")
+        assert shown == 49
+        judged = clip_truth(sample, shown=shown).box_tracks
+        assert len(judged) == 5 and max(judged) < 9
+        assert judged == set(chosen_tracks([one for one in labels if one.frame < 49], key="v_0"))
+    (tmp_path / "v_0.json").write_text('{"made by": "others"}')
+    assert shown_frames(tmp_path / "v_0.json") is None and shown_frames(tmp_path / "none.json") is None
+    assert max(clip_truth(sample).box_tracks) > 8, "without a record, the whole clip"
+    from labeling.extractors import ExtractorChoice
+
+    assert record_notes(["v_0"], ["v_0"], ExtractorChoice()) == [], "no boxes are judged"
+    choice: Any = SimpleNamespace(cards=["one"])
+    assert "1 of 2 clips have no record" in record_notes(["v_0", "w_0"], ["v_0"], choice)[0]
 
 
 def motion(**changes: Any) -> Any:

@@ -93,6 +93,11 @@ class ClipGenerator:
         """Video frames of a sample."""
         return self.frames or self.backbone.config.picture.frames or _DEFAULT_FRAMES
 
+    @property
+    def first_stage(self) -> Stage:
+        """The stage that is given the clip's conditions."""
+        return next(stage for stage in ("motion", "appearance", "end_to_end") if stage in self.files)
+
     def picture(self, stage: Stage) -> PictureConfig:
         """The sizes that a stage's adapter was trained at; the backbone's for foreign files."""
         about = self.files[stage].about if stage in self.files else {}

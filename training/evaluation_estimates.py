@@ -53,13 +53,17 @@ class EstimateSettings:
     ego: EgoSettings = field(default_factory=EgoSettings)
 
 
-def clip_truth(sample: Sample, *, object_variant: int = 0, ego_condition: np.ndarray | None = None) -> ClipTruth:
+def clip_truth(
+    sample: Sample, *, object_variant: int = 0, ego_condition: np.ndarray | None = None, shown: int | None = None
+) -> ClipTruth:
     """A packed clip as the truth of its samples.
 
     Args:
         sample: the clip.
         object_variant: which of the object videos the samples were conditioned on.
         ego_condition: (T, 4, 4) trajectory that was asked for instead of the clip's own.
+        shown: frames from the clip's first that the object videos were made of: only tracks in them were drawn from.
+            None means the whole clip.
 
     Raises:
         DataError: a member that is missing or broken, or an ``ego_condition`` of another length.
@@ -68,10 +72,11 @@ def clip_truth(sample: Sample, *, object_variant: int = 0, ego_condition: np.nda
     if ego_condition is not None and len(ego_condition) != len(poses):
         raise DataError(f"{sample.key}: was conditioned on {len(ego_condition)} poses, the clip has {len(poses)}")
     labels = tuple(label for label in sample.keypoints() if label.category != "lane")
+    inside = [label for label in labels if shown is None or label.frame < shown]
     return ClipTruth(
         key=sample.key, video_id=meta["video_id"], split=meta.get("split", "train"),
         times_s=np.arange(len(poses)) / float(meta["fps"]), cam_to_world=poses, ego_condition=ego_condition,
-        labels=labels, box_tracks=frozenset(chosen_tracks(labels, key=sample.key, variant=object_variant)),
+        labels=labels, box_tracks=frozenset(chosen_tracks(inside, key=sample.key, variant=object_variant)),
         width=meta["picture"]["width"], height=meta["picture"]["height"],
     )  # fmt: skip
 

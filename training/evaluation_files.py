@@ -1,5 +1,6 @@
 """Folders of generated videos: which file is a sample of which clip, and its frames at their own times and size."""
 
+import json
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -115,6 +116,21 @@ def sample_name(stem: str, keys: Collection[str]) -> tuple[str, int] | None:
     if whole:
         return stem, 0
     return (numbered["key"], int(numbered["number"])) if split and numbered is not None else None
+
+
+def shown_frames(record: Path) -> int | None:
+    """How many frames of its clip, from the first, a generator's conditions were made of; None where nothing tells.
+
+    Args:
+        record: ``<key>.json`` beside the samples, as ``animatic generate`` writes it.
+    """
+    try:
+        tree = json.loads(record.read_text(encoding="utf-8"))
+        step = tree["frame_step"] if "frame_step" in tree else tree["backbone"]["picture"]["frame_step"]
+        return (int(tree["frames"]) - 1) * int(step) + 1
+    except (OSError, ValueError, KeyError, TypeError):
+        # Samples of others have no record, or one of their own.
+        return None
 
 
 def read_sample(path: Path) -> SampleVideo:

@@ -20,7 +20,7 @@ from training.adapters import read_adapter
 from training.backbone import Backbone, SamplingSettings
 from training.backbones import load_backbone
 from training.clip_generator import ClipConditions, ClipGenerator, GeneratedClip
-from training.config import BackboneConfig, Stage, backbone_config
+from training.config import BackboneConfig, backbone_config
 from training.sampling_inputs import (
     LabelledFrame,
     control_clip,
@@ -181,6 +181,7 @@ def sampling_record(
     return {
         "caption": caption, "seed": seed, "samples": samples, "sampling": asdict(settings),
         "backbone": generator.backbone.config.model_dump(mode="json"), "frames": generator.frame_count,
+        "frame_step": generator.picture(generator.first_stage).frame_step,
     }  # fmt: skip
 
 
@@ -193,7 +194,7 @@ def prepare_conditions(
 ) -> ClipConditions:  # fmt: skip
     """What ``generate`` is given, as pictures. See there."""
     pixels = read_image(image) if isinstance(image, Path) else image
-    stage: Stage = "motion" if "motion" in generator.files else next(iter(generator.files))
+    stage = generator.first_stage
     picture, count = generator.picture(stage), generator.frame_count
     if isinstance(skeleton, LabelledFrame):
         first = skeleton.drawn(picture)
