@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -80,7 +80,7 @@ def generate(
     steps: Annotated[int, typer.Option(min=1, help="Denoising steps per stage.")] = 30,
     guidance: Annotated[float, typer.Option(help="Classifier-free guidance.")] = 3.0,
     coordinates: Annotated[
-        str, typer.Option(help="consistent, or released with the released adapters.")
+        Literal["consistent", "released"], typer.Option(help="consistent, or released with the released adapters.")
     ] = "consistent",
     frames: Annotated[int | None, typer.Option(help="By default what the adapters were trained on.")] = None,
     extractors: Extractors = None,

@@ -107,12 +107,13 @@ def generate_clips(
     """
     options = options or GenerateOptions()
     _check(request, options, adapters)
+    settings = SamplingSettings(steps=options.steps, guidance=options.guidance, coordinates=options.coordinates)
     samples = chosen_clips(job, request.clips)
     generator = open_generator(options.backbone, **adapters, frames=options.frames, device=options.device)
     hashes = {stage: _adapter_hash(path) for stage, path in sorted(adapters.items())}
     made = 0
     for number, sample in enumerate(samples):
-        made += _make(generator, sample, request, out=out, options=options, adapters=hashes)
+        made += _make(generator, sample, request, out=out, options=options, settings=settings, adapters=hashes)
         if on_clip is not None:
             on_clip(number + 1, len(samples))
     return made, len(samples) - made
@@ -127,10 +128,9 @@ def _check(request: ClipsRequest, options: GenerateOptions, adapters: Mapping[st
 
 def _make(
     generator: ClipGenerator, sample: Sample, request: ClipsRequest, *, out: Path, options: GenerateOptions,
-    adapters: Mapping[str, str],
+    settings: SamplingSettings, adapters: Mapping[str, str],
 ) -> bool:  # fmt: skip
     """Make one clip's samples; False where they were there."""
-    settings = SamplingSettings(steps=options.steps, guidance=options.guidance, coordinates=options.coordinates)
     caption = request.caption or sample.caption
     about = {
         "adapters": dict(adapters), "ego": request.ego or "the clip's own", "true_skeletons": request.true_skeletons,

@@ -17,6 +17,7 @@ from pipelines.console import counting_bar, file_size, make_console
 from pipelines.stage import parse_part
 from training.config import STAGES, Stage, load_config
 from training.dry_run import RunPlan
+from training.flow import Convention
 from training.generation import GeneratedFiles, generate
 from training.latents import CacheSummary, cache_latents
 from training.sampling_inputs import LabelledFrame
@@ -34,7 +35,7 @@ class GenerateOptions:
     seed: int = 0
     steps: int = 30
     guidance: float = 3.0
-    coordinates: str = "consistent"
+    coordinates: Convention = "consistent"
     frames: int | None = None
     extractors: tuple[str, ...] | None = None
     models_dir: Path | None = None

@@ -204,6 +204,39 @@ def test_what_is_missing_or_wrong_is_named(generator, adapters, tmp_path: Path, 
         generate(image=IMAGE, caption="x", out=tmp_path, **two_stages(adapters))
 
 
+@pytest.mark.parametrize("slots", [("motion", "appearance"), ("motion", "end_to_end"), ("end_to_end", "motion")])
+def test_an_adapter_of_another_stage_is_refused_by_name(adapters, tmp_path: Path, slots: tuple[Stage, Stage]) -> None:
+    given, slot = slots
+    words = f"of the {given} stage, not of the {slot} stage.*--{given.replace('_', '-')}"
+    with pytest.raises(ConfigError, match=words):
+        generate(image=IMAGE, caption="x", out=tmp_path, skeleton=SKELETON, **{slot: adapters[given]})
+
+
+def test_adapters_of_other_controls_or_frame_rates_do_not_pair(
+    adapters, generator, tmp_path: Path, monkeypatch
+) -> None:
+    real = ClipGenerator.control_name
+    monkeypatch.setattr(
+        ClipGenerator, "control_name", lambda self, stage: "hdmap" if stage == "motion" else real(self, stage)
+    )
+    backbone = load_backbone(generator.backbone.config)
+    with pytest.raises(ConfigError, match="drafts hdmap videos, the appearance adapter paints over skeleton videos"):
+        ClipGenerator(backbone, **two_stages(adapters))
+    monkeypatch.undo()
+    halved = generator.picture("motion").model_copy(update={"frame_step": 2})
+    picture = ClipGenerator.picture
+    monkeypatch.setattr(
+        ClipGenerator, "picture", lambda one, stage: halved if stage == "motion" else picture(one, stage)
+    )
+    with pytest.raises(ConfigError, match="works at 12 fps, the appearance adapter at 24 fps"):
+        ClipGenerator(load_backbone(generator.backbone.config), **two_stages(adapters))
+
+
+def test_misspelt_coordinates_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="'relased' are not known; choose one of consistent, released"):
+        generate(image=IMAGE, caption="x", out=tmp_path, motion=tmp_path / "unread", coordinates="relased")
+
+
 def test_a_folder_that_cannot_be_written_to_is_a_storage_error(generator, tmp_path: Path) -> None:
     from labeling.errors import StorageError
     from training.generation import GeneratedClip, write_clip

@@ -7,6 +7,7 @@ Extra trained tensors (SVD's widened ``conv_in`` and its text projection) go und
 Switching changes flags only: the base weights are never merged, so switching off restores the base to the bit.
 """
 
+import contextlib
 import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -168,12 +169,9 @@ def read_adapter(path: Path) -> AdapterFile:
         ModelError: missing, not safetensors, or without a LoRA in it.
     """
     path = path / "adapter.safetensors" if path.is_dir() else path
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            raw = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        raise ModelError(f"{path} is no adapter: {error}; give the .safetensors file that training wrote") from error
+    with _opened(path) as file:
+        metadata = file.metadata() or {}
+        raw = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     extra = {key.removeprefix(EXTRA_PREFIX): raw.pop(key) for key in list(raw) if key.startswith(EXTRA_PREFIX)}
     alphas = {float(raw.pop(key)) for key in list(raw) if key.endswith(".alpha")}
     tensors = {_plain_key(key): tensor for key, tensor in raw.items()}
@@ -188,8 +186,31 @@ def read_adapter(path: Path) -> AdapterFile:
     if alpha is None:
         alpha = alphas.pop() if len(alphas) == 1 else float(rank)
     targets = tuple(sorted({key.split(".lora_")[0] for key in tensors}))
-    about = json.loads(metadata.get(OUR_METADATA, "{}"))
+    about = _about(metadata)
     return AdapterFile(tensors=tensors, extra=extra, rank=rank, alpha=alpha, targets=targets, about=about)
+
+
+def read_about(path: Path) -> dict[str, Any]:
+    """What the trainer noted in an adapter file, without reading its tensors; empty for foreign files.
+
+    Raises:
+        ModelError: missing, or not safetensors.
+    """
+    with _opened(path / "adapter.safetensors" if path.is_dir() else path) as file:
+        return _about(file.metadata() or {})
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            yield file
+    except (OSError, SafetensorError) as error:
+        raise ModelError(f"{path} is no adapter: {error}; give the .safetensors file that training wrote") from error
+
+
+def _about(metadata: Mapping[str, str]) -> dict[str, Any]:
+    return json.loads(metadata.get(OUR_METADATA, "{}"))
 
 
 def _plain_key(key: str) -> str:

@@ -7,7 +7,7 @@ D text channels, T video frames.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, get_args
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ import torch
 from labeling.errors import ConfigError
 from training.adapters import AdapterFile
 from training.config import AdapterConfig, BackboneConfig
+from training.flow import Convention
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,13 +119,23 @@ class StageInputs:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SamplingSettings:
-    """How a sample is drawn."""
+    """How a sample is drawn.
+
+    Raises:
+        ConfigError: coordinates of an unknown name.
+    """
 
     steps: int = 30
     guidance: float = 3.0
     """Classifier-free guidance (Ho and Salimans 2022); 1 switches it off."""
-    coordinates: str = "consistent"
-    """``consistent``, or ``released`` for the released adapters."""
+    coordinates: Convention = "consistent"
+    """``released`` for the released adapters."""
+
+    def __post_init__(self) -> None:
+        if self.coordinates not in get_args(Convention):
+            raise ConfigError(
+                f"coordinates {self.coordinates!r} are not known; choose one of {', '.join(get_args(Convention))}"
+            )
 
 
 class Backbone(Protocol):

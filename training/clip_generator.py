@@ -12,7 +12,7 @@ import torch
 
 from labeling.camera import Trajectory
 from labeling.errors import ConfigError
-from training.adapters import AdapterFile, activate_adapter
+from training.adapters import AdapterFile, activate_adapter, read_about
 from training.backbone import Backbone, SamplingSettings, TextEmbedding
 from training.config import PictureConfig, Stage
 from training.draws import keyed_normal, keyed_seed
@@ -63,7 +63,7 @@ class ClipGenerator:
         frames: video frames; what the adapters were trained on if None.
 
     Raises:
-        ConfigError: no adapter, or ones that exclude each other.
+        ConfigError: no adapter, ones that exclude each other, or one of another stage, control video or frame rate.
         ModelError: adapters that do not fit the backbone.
     """
 
@@ -82,11 +82,29 @@ class ClipGenerator:
         if not chosen or ("end_to_end" in chosen and len(chosen) > 1):
             raise ConfigError("give --motion and --appearance (either alone works too), or --end-to-end alone")
         for stage, path in chosen.items():
+            _check_stage(path, stage)
+        for stage, path in chosen.items():
             self.files[stage] = self.backbone.load_adapter(path, stage)
+        if len(chosen) > 1:
+            self._check_pair()
         if self.frames is None:
             self.frames = next((f.about["frames"] for f in self.files.values() if f.about.get("frames")), None)
         self._empty = self.backbone.encode_text([""])[0]
         self._texts: dict[str, TextEmbedding] = {}
+
+    def _check_pair(self) -> None:
+        drafted, painted = self.control_name("motion"), self.control_name("appearance")
+        if drafted != painted:
+            raise ConfigError(
+                f"the motion adapter drafts {drafted} videos, the appearance adapter paints over {painted} videos; "
+                "give two that were trained with the same conditions.control"
+            )
+        rates = [self.picture(stage).rate for stage in ("motion", "appearance")]
+        if rates[0] != rates[1]:
+            raise ConfigError(
+                f"the motion adapter works at {rates[0]} fps, the appearance adapter at {rates[1]} fps; give two that "
+                "were trained with the same picture.frame_step"
+            )
 
     @property
     def frame_count(self) -> int:
@@ -222,3 +240,12 @@ class ClipGenerator:
 
     def _decoded(self, latents: torch.Tensor, seed: int, number: int) -> np.ndarray:
         return self.backbone.decode_video(latents, seed=keyed_seed(seed, number, "decode") % 2**31)
+
+
+def _check_stage(path: Path, stage: Stage) -> None:
+    told = read_about(path).get("stage", stage)
+    if told != stage:
+        raise ConfigError(
+            f"{path} is an adapter of the {told} stage, not of the {stage} stage; give it with "
+            f"--{told.replace('_', '-')}"
+        )

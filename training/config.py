@@ -5,6 +5,7 @@ motion steps under a cosine, 5,000 appearance steps under a line, LoRA of rank 5
 """
 
 from collections.abc import Mapping
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -45,6 +46,16 @@ class PictureConfig(_Settings):
     def fps(self) -> float:
         """Frame rate that the backbone sees."""
         return self.clip_fps / self.frame_step
+
+    @property
+    def rate(self) -> Fraction:
+        """``fps`` as videos are written."""
+        return exact_rate(self.fps)
+
+
+def exact_rate(fps: float) -> Fraction:
+    """The frame rate behind a float: 24/7 of 3.428..., 24000/1001 of 23.976..."""
+    return Fraction(fps).limit_denominator(1001)
 
 
 class BackboneConfig(_Settings):

@@ -16,11 +16,12 @@ from dataset.receipts import storage_errors
 from labeling.camera import Intrinsics, Trajectory, write_tum
 from labeling.encoding import VideoWriter, lossless_rgb
 from labeling.errors import ConfigError
-from training.adapters import read_adapter
+from training.adapters import read_about
 from training.backbone import Backbone, SamplingSettings
 from training.backbones import load_backbone
 from training.clip_generator import ClipConditions, ClipGenerator, GeneratedClip
 from training.config import BackboneConfig, backbone_config
+from training.flow import Convention
 from training.sampling_inputs import (
     LabelledFrame,
     control_clip,
@@ -73,7 +74,7 @@ def generate(
     seed: int = 0,
     steps: int = 30,
     guidance: float = 3.0,
-    coordinates: str = "consistent",
+    coordinates: Convention = "consistent",
     frames: int | None = None,
     name: str | None = None,
     extractors: Sequence[str] | None = None,
@@ -111,6 +112,8 @@ def generate(
         ModelError: weights that are absent or do not fit.
         StorageError: no space left.
     """
+    # Checked before anything is loaded.
+    settings = SamplingSettings(steps=steps, guidance=guidance, coordinates=coordinates)
     generator = open_generator(
         backbone, motion=motion, appearance=appearance, end_to_end=end_to_end, frames=frames, device=device
     )
@@ -120,7 +123,7 @@ def generate(
     )  # fmt: skip
     return write_samples(
         generator, conditions, out=out, name=name or (image.stem if isinstance(image, Path) else "sample"),
-        samples=samples, seed=seed, settings=SamplingSettings(steps=steps, guidance=guidance, coordinates=coordinates),
+        samples=samples, seed=seed, settings=settings,
     )  # fmt: skip
 
 
@@ -243,7 +246,7 @@ def _loaded_backbone(
 def _told_config(adapters: Sequence[Path | None]) -> BackboneConfig:
     """The backbone that the adapters say they were trained on."""
     for path in adapters:
-        told: dict[str, Any] = read_adapter(Path(path)).about.get("config", {}) if path is not None else {}
+        told: dict[str, Any] = read_about(Path(path)).get("config", {}) if path is not None else {}
         if told:
             return BackboneConfig.model_validate(told["backbone"])
     raise ConfigError("the adapters do not say which backbone they are for; give --backbone")

@@ -167,7 +167,7 @@ class LtxBackbone(LazyParts):
         self, inputs: StageInputs, *, noise_BCFHW: torch.Tensor, empty_text: TextEmbedding, settings: SamplingSettings
     ) -> torch.Tensor:
         """Euler steps from noise to (B, C, F, H, W) float32; the first latent frame stays clean throughout."""
-        convention: Convention = "released" if settings.coordinates == "released" else "consistent"
+        convention = settings.coordinates
         sigmas = sampling_sigmas(settings.steps, tokens=sequence_tokens(inputs)[0], convention=convention)
         latents = noise_BCFHW.to(self.device).float()
         for sigma, following in zip(sigmas[:-1].tolist(), sigmas[1:].tolist(), strict=True):
