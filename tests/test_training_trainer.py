@@ -20,7 +20,7 @@ from training.config import TrainConfig
 from training.guards import TrainingError, memory_advice, memory_knobs
 from training.latents import open_store
 from training.run_log import RunLog, read_metrics
-from training.run_state import RunState, read_state
+from training.run_state import RunState, config_differences, read_state
 from training.trainer import Trainer, TrainSummary, train
 
 
@@ -301,6 +301,23 @@ def test_resume_refuses_other_settings_and_never_refuses_a_used_folder(tiny_job:
     with pytest.raises(ConfigError, match="already has checkpoints"):
         run(config, tiny_job, tmp_path, resume="never")
     assert run(config, tiny_job, tmp_path).losses == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "seen"),
+    [
+        ({"picture": PICTURE | {"control_width": 192}}, ["picture.control_width"]),
+        ({"dtype": "bfloat16", "text_tokens": 3, "seed": 7}, ["dtype", "seed", "text_tokens"]),
+        ({"vae_tiling": True}, []),
+    ],
+    ids=["sizes", "network", "harmless"],
+)  # fmt: skip
+def test_a_resume_may_change_nothing_of_the_backbone_that_moves_the_losses(change, seen) -> None:
+    held = tiny_config("motion").model_dump(mode="json")
+    changed = config_differences(held, tiny_config("motion", backbone={"picture": PICTURE, **change}))
+    assert sorted(changed) == [f"backbone.{name}" for name in seen]
+    del held["backbone"]["vae_tiling"]
+    assert config_differences(held, tiny_config("motion")) == []
 
 
 def test_held_out_loss_does_not_depend_on_step_seed_of_order_or_dropout(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811

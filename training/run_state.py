@@ -15,6 +15,8 @@ from training.config import TrainConfig
 
 ADAPTER, OPTIMISER, STATE = "adapter.safetensors", "optimiser.safetensors", "state.json"
 _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
+_HARMLESS = ("backbone.vae_tiling",)
+"""Of the backbone's settings: training decodes validation videos alone."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,14 +98,24 @@ def restore(
             }
 
 
+def _changed(held: Mapping[str, Any], now: Mapping[str, Any], path: str) -> list[str]:
+    differences = []
+    for name, value in now.items():
+        place = f"{path}.{name}"
+        if isinstance(value, dict) and isinstance(held.get(name), dict):
+            differences += _changed(held[name], value, place)
+        # A setting that an older version did not know was as its default is.
+        elif name in held and held[name] != value and place not in _HARMLESS:
+            differences.append(place)
+    return differences
+
+
 def config_differences(held: Mapping[str, Any], config: TrainConfig) -> list[str]:
     """Settings that a resume must not change, where they do: everything that moves the losses."""
     now = config.model_dump(mode="json")
     watched = ("stage", "adapter", "conditions", "targeted_noise", "seed")
     differences = [name for name in watched if held.get(name) != now[name]]
-    for name in ("name", "kind", "weights"):
-        if held.get("backbone", {}).get(name) != now["backbone"][name]:
-            differences.append(f"backbone.{name}")
+    differences += _changed(held.get("backbone", {}), now["backbone"], "backbone")
     for name, value in now["optimiser"].items():
         if name != "micro_batch" and held.get("optimiser", {}).get(name) != value:
             differences.append(f"optimiser.{name}")
