@@ -133,7 +133,7 @@ def _make(
     """Make one clip's samples; False where they were there."""
     caption = request.caption or sample.caption
     about = {
-        "adapters": dict(adapters), "ego": request.ego or "the clip's own", "true_skeletons": request.true_skeletons,
+        "adapters": dict(adapters), "ego": _told_ego(request.ego), "true_skeletons": request.true_skeletons,
         "object_variant": request.object_variant, "clip": {name: row.sha256 for name, row in sample.members.items()},
     }  # fmt: skip
     record = sampling_record(generator, caption, samples=options.samples, seed=options.seed, settings=settings)
@@ -181,6 +181,13 @@ def _objects(sample: Sample, picture: PictureConfig, count: int, variant: int) -
         label_height=size["height"],
     )  # fmt: skip
     return np.stack(list(frames)[:: picture.frame_step])
+
+
+def _told_ego(ego: str | None) -> str | dict[str, str]:
+    """The trajectory as a record tells it: words as they are, a file by its content, which may change."""
+    if ego is None:
+        return "the clip's own"
+    return {"file": Path(ego).name, "sha256": sha256_file(Path(ego))} if Path(ego).is_file() else ego
 
 
 def _adapter_hash(path: Path) -> str:

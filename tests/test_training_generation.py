@@ -1,5 +1,6 @@
 """The two-stage generator: conditions, seeds, hand-over of latents, recipes for ego-motion, clear answers."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +19,19 @@ from training_fixtures import (  # noqa: F401
     walker,
 )
 
-from labeling.camera import rotation_angle_deg, write_tum
+from labeling.camera import prior_intrinsics, rebased_trajectory, rotation_angle_deg, write_tum
 from labeling.errors import ConfigError, DataError, ModelError
 from labeling.labels import Keypoints
 from labeling.skeleton_video import draw_skeletons
-from labeling.video import frame_count, read_frames
+from labeling.video import frame_count, read_frames, read_packet_times
+from pipelines.generate_clips import ClipsRequest, _make
+from pipelines.train import GenerateOptions
 from training.backbone import SamplingSettings
 from training.backbones import load_backbone
 from training.clip_views import clip_trajectory
 from training.config import PictureConfig, Stage, backbone_config
 from training.ego_recipes import recipe_trajectory
-from training.generation import ClipConditions, ClipGenerator, prepare_conditions
+from training.generation import ClipConditions, ClipGenerator, prepare_conditions, write_samples
 from training.generation import generate as generate_files
 from training.latents import cache_latents
 from training.sampling_inputs import LABEL_WIDTH, control_clip, ego_trajectory, first_skeleton
@@ -235,6 +238,66 @@ def test_adapters_of_other_controls_or_frame_rates_do_not_pair(
 def test_misspelt_coordinates_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="'relased' are not known; choose one of consistent, released"):
         generate(image=IMAGE, caption="x", out=tmp_path, motion=tmp_path / "unread", coordinates="relased")
+
+
+def test_a_killed_repeat_leaves_no_record_beside_other_videos(generator, tmp_path: Path, monkeypatch) -> None:
+    conditions = ClipConditions(
+        image=IMAGE, caption="x", first_control=SKELETON, trajectory=ego_trajectory("still", frames=9, fps=24)
+    )
+    fast = SamplingSettings(steps=1, guidance=1.0)
+    write_samples(generator, conditions, out=tmp_path, name="v_0", samples=2, settings=fast)
+    # A neighbour whose name begins alike is not of this clip.
+    (tmp_path / "v_0_1_0.mp4").write_bytes(b"another's")
+    real = generator.sample
+
+    def killed(*given: Any, number: int, **named: Any) -> Any:
+        if number == 1:
+            raise KeyboardInterrupt
+        return real(*given, number=number, **named)
+
+    monkeypatch.setattr(generator, "sample", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_samples(generator, conditions, out=tmp_path, name="v_0", samples=3, seed=1, settings=fast)
+    assert sorted(path.name for path in tmp_path.glob("v_0*")) == ["v_0_0.mp4", "v_0_1_0.mp4"]
+    monkeypatch.undo()
+    write_samples(generator, conditions, out=tmp_path, name="v_0", samples=3, seed=1, settings=fast)
+    still = ClipConditions(image=IMAGE, caption="x", first_control=SKELETON)
+    write_samples(generator, still, out=tmp_path, name="v_0", samples=1, settings=fast)
+    for folder, kept in ((tmp_path, ["v_0_0.mp4", "v_0_1_0.mp4"]), (tmp_path / "skeleton", ["v_0_0.mp4"])):
+        assert sorted(path.name for path in folder.glob("*.mp4")) == kept
+    assert not list((tmp_path / "conditions").iterdir()), "this one was asked for no trajectory"
+
+
+def test_a_clip_is_made_again_when_the_trajectory_file_changes(generator, tmp_path: Path) -> None:
+    meta = {
+        "picture": {"width": WIDTH, "height": HEIGHT}, "intrinsics": asdict(prior_intrinsics(WIDTH, HEIGHT)), "fps": 24
+    }  # fmt: skip
+    sample: Any = FakeSample(key="v_0", meta=meta)
+    sample.members, sample.iterate_frames = {}, lambda suffix: iter(sample.frames(suffix))
+    request = ClipsRequest(ego=str(tmp_path / "drive.tum"))
+    options = GenerateOptions(steps=1, guidance=1.0)
+
+    def made(speed: float) -> bool:
+        poses = np.tile(np.eye(4), (9, 1, 1))
+        poses[:, 2, 3] = speed * np.arange(9)
+        write_tum(rebased_trajectory(np.arange(9) / 24, poses), tmp_path / "drive.tum")
+        settings = SamplingSettings(steps=1, guidance=1.0)
+        return _make(generator, sample, request, out=tmp_path / "o", options=options, settings=settings, adapters={})
+
+    assert [made(speed) for speed in (0.1, 0.1, 2.0, 2.0)] == [True, False, True, False]
+
+
+def test_videos_have_the_adapters_frame_rate_whatever_the_backbone_says(tmp_path: Path) -> None:
+    halved = PICTURE | {"frame_step": 5}
+    datasets = {"train": [FakeSample(key="a_0", frames_count=41)], "val": []}
+    cache_latents(tmp_path, backbone_name="tiny", picture=halved, datasets=datasets)
+    config = tiny_config("motion", backbone={"picture": halved}, optimiser={"steps": 1})
+    train(config, data=tmp_path, out=tmp_path / "m", quiet=True)
+    (made,) = generate(
+        image=IMAGE, caption="x", out=tmp_path / "o", motion=tmp_path / "m", skeleton=SKELETON, steps=1, backbone="tiny"
+    )
+    times = read_packet_times(made.control).times_s
+    assert len(times) == 9 and np.diff(times) == pytest.approx(np.full(8, 5 / 24), abs=1e-4)
 
 
 def test_a_folder_that_cannot_be_written_to_is_a_storage_error(generator, tmp_path: Path) -> None:

@@ -6,13 +6,14 @@ The sampling itself is ``clip_generator``'s. The same seed gives the same files.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from dataset.receipts import storage_errors
+from dataset.receipts import atomic_write, storage_errors
 from labeling.camera import Intrinsics, Trajectory, write_tum
 from labeling.encoding import VideoWriter, lossless_rgb
 from labeling.errors import ConfigError
@@ -146,7 +147,10 @@ def write_samples(
     generator: ClipGenerator, conditions: ClipConditions, *, out: Path, name: str, samples: int = 1, seed: int = 0,
     settings: SamplingSettings | None = None, about: Mapping[str, Any] | None = None,
 ) -> list[GeneratedFiles]:  # fmt: skip
-    """Sample and write: ``<name>_<n>.mp4``, ``skeleton/<name>_<n>.mp4``, ``conditions/<name>.tum``, and last a record.
+    """Sample and write: ``conditions/<name>.tum``, ``<name>_<n>.mp4``, ``skeleton/<name>_<n>.mp4``, and last a record.
+
+    What an earlier record of that name says was written is taken away first, so that no video is ever found beside a
+    record of other settings, however a run ends.
 
     Args:
         generator: with its adapters.
@@ -162,19 +166,36 @@ def write_samples(
         ConfigError: conditions that are missing or do not fit.
         StorageError: no space left.
     """
-    settings, config = settings or SamplingSettings(), generator.backbone.config
-    written = []
-    for number in range(samples):
-        clip = generator.sample(conditions, seed=seed, number=number, settings=settings)
-        written.append(write_clip(clip, out, f"{name}_{number}", fps=config.picture.fps, seed=seed, number=number))
-    record = sampling_record(generator, conditions.caption, samples=samples, seed=seed, settings=settings)
+    settings, rate = settings or SamplingSettings(), generator.picture(generator.first_stage).rate
     with storage_errors(out):
+        _take_away(out, name)
         if conditions.trajectory is not None:
             (out / "conditions").mkdir(parents=True, exist_ok=True)
             write_tum(conditions.trajectory, out / "conditions" / f"{name}.tum")
-        text = json.dumps({**record, **(about or {})}, sort_keys=True, indent=1)
-        (out / f"{name}.json").write_text(f"{text}\n", encoding="utf-8")
+    written = []
+    for number in range(samples):
+        clip = generator.sample(conditions, seed=seed, number=number, settings=settings)
+        written.append(write_clip(clip, out, f"{name}_{number}", fps=rate, seed=seed, number=number))
+    record = sampling_record(generator, conditions.caption, samples=samples, seed=seed, settings=settings)
+    text = json.dumps({**record, **(about or {})}, sort_keys=True, indent=1)
+    atomic_write(out / f"{name}.json", f"{text}\n".encode())
     return written
+
+
+def _take_away(out: Path, name: str) -> None:
+    """What the record of an earlier run lists, and the record last: a kill in between leaves it to the next run."""
+    record = out / f"{name}.json"
+    if not record.is_file():
+        return
+    try:
+        count = int(json.loads(record.read_text(encoding="utf-8"))["samples"])
+    except (ValueError, KeyError, TypeError):
+        count = 0
+    for number in range(count):
+        for folder in (out, out / "skeleton"):
+            (folder / f"{name}_{number}.mp4").unlink(missing_ok=True)
+    (out / "conditions" / f"{name}.tum").unlink(missing_ok=True)
+    record.unlink()
 
 
 def sampling_record(
@@ -218,7 +239,9 @@ def prepare_conditions(
     )  # fmt: skip
 
 
-def write_clip(clip: GeneratedClip, out: Path, stem: str, *, fps: float, seed: int, number: int) -> GeneratedFiles:
+def write_clip(
+    clip: GeneratedClip, out: Path, stem: str, *, fps: int | Fraction, seed: int, number: int
+) -> GeneratedFiles:
     """Write one sample: RGB at the folder's root, the skeleton video under ``skeleton/``, lossless."""
     rgb = out / f"{stem}.mp4" if clip.rgb is not None else None
     control = out / "skeleton" / f"{stem}.mp4" if clip.control is not None else None
@@ -228,7 +251,7 @@ def write_clip(clip: GeneratedClip, out: Path, stem: str, *, fps: float, seed: i
                 continue
             path.parent.mkdir(parents=True, exist_ok=True)
             height, width = frames.shape[1:3]
-            with VideoWriter(path, width=width, height=height, fps=round(fps), settings=settings) as writer:
+            with VideoWriter(path, width=width, height=height, fps=fps, settings=settings) as writer:
                 for frame in frames:
                     writer.write(frame)
     return GeneratedFiles(rgb=rgb, control=control, seed=seed, number=number)

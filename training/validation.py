@@ -12,7 +12,7 @@ from dataset.receipts import storage_errors
 from labeling.encoding import VideoWriter
 from training.backbone import Backbone, SamplingSettings
 from training.batches import TrainingItems
-from training.config import TrainConfig
+from training.config import TrainConfig, exact_rate
 from training.draws import keyed_normal
 from training.latent_store import LatentStore
 
@@ -92,7 +92,7 @@ def write_validation_videos(
 
 def _write_pair(path: Path, truth: np.ndarray, sample: np.ndarray, *, fps: float) -> Path:
     both = np.concatenate([truth, sample], axis=2)
-    with VideoWriter(path, width=both.shape[2], height=both.shape[1], fps=round(fps)) as writer:
+    with VideoWriter(path, width=both.shape[2], height=both.shape[1], fps=exact_rate(fps)) as writer:
         for frame in both:
             writer.write(frame)
     return path
