@@ -105,7 +105,10 @@ def generate(
             true_skeletons=true_skeletons,
             object_variant=object_variant,
         )
-        show_clips(data, request, out=out, motion=motion, appearance=appearance, end_to_end=end_to_end, options=options)
+        show_clips(
+            data, request, out=out, motion=motion, appearance=appearance, end_to_end=end_to_end, image=image,
+            skeleton=skeleton, options=options,
+        )  # fmt: skip
         return
     run_generate(
         out=out, motion=motion, appearance=appearance, end_to_end=end_to_end, image=image, caption=caption,

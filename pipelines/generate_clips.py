@@ -19,7 +19,7 @@ from labeling.object_video import object_frames
 from labeling.skeleton_video import draw_skeletons
 from labeling.timeline import Span
 from pipelines.console import counting_bar, make_console
-from pipelines.train import GenerateOptions, clip_conditions
+from pipelines.train import GenerateOptions, check_start, clip_conditions
 from training.backbone import SamplingSettings
 from training.config import PictureConfig
 from training.generation import ClipGenerator, open_generator, prepare_conditions, sampling_record, write_samples
@@ -64,7 +64,8 @@ def chosen_clips(job: Path, clips: str) -> list[Sample]:
 
 def show_clips(
     job: Path | None, request: ClipsRequest, *, out: Path, motion: Path | None, appearance: Path | None,
-    end_to_end: Path | None = None, options: GenerateOptions | None = None,
+    end_to_end: Path | None = None, image: Path | None = None, skeleton: Path | None = None,
+    options: GenerateOptions | None = None,
 ) -> None:  # fmt: skip
     """As ``generate_clips``, with a bar, and a line about what came of it.
 
@@ -73,6 +74,7 @@ def show_clips(
     """
     if job is None:
         raise ConfigError("--clips, --true-skeletons and --object-variant are of a job's clips; give --data JOB too")
+    check_start(data=job, image=image, skeleton=skeleton)
     given = {"motion": motion, "appearance": appearance, "end_to_end": end_to_end}
     with counting_bar() as progress:
         task = progress.add_task("generate", total=None)

@@ -122,10 +122,11 @@ def run_generate(
     """Generate from a picture and a text, or from a clip of a job: its first frame, caption, skeletons and trajectory.
 
     Raises:
-        ConfigError: neither a picture nor a clip, or no adapter.
+        ConfigError: neither a picture nor a clip, both, or no adapter.
         AnimaticError: as ``generate``.
     """
     options = options or GenerateOptions()
+    check_start(data=data, clip=clip, image=image, skeleton=skeleton)
     if data is not None:
         sample = find_sample(data, clip)
         conditions = clip_conditions(sample, with_ego=ego is None)
@@ -148,6 +149,24 @@ def run_generate(
     for made in files:
         console.print(" ".join(str(path) for path in (made.control, made.rgb) if path is not None))
     return files
+
+
+def check_start(
+    *, data: Path | None, clip: str | None = None, image: Path | None = None, skeleton: Path | None = None
+) -> None:
+    """Refuse two things to start from, of which one would be left out without a word.
+
+    Raises:
+        ConfigError: a picture beside a job's clip, or a clip of no job.
+    """
+    own = [name for name, given in (("--image", image), ("--skeleton", skeleton)) if given is not None]
+    if data is not None and own:
+        raise ConfigError(
+            f"--data starts from a clip's own first frame and skeletons, so {' and '.join(own)} would not be used; "
+            "give one or the other"
+        )
+    if data is None and clip is not None:
+        raise ConfigError(f"--clip {clip} is of a job; give --data JOB too")
 
 
 def clip_conditions(sample: Sample, *, with_ego: bool = True) -> dict[str, Any]:

@@ -19,13 +19,14 @@ from training_fixtures import (  # noqa: F401
     walker,
 )
 
+from dataset.tables import write_keypoints
 from labeling.camera import prior_intrinsics, rebased_trajectory, rotation_angle_deg, write_tum
 from labeling.errors import ConfigError, DataError, ModelError
 from labeling.labels import Keypoints
 from labeling.skeleton_video import draw_skeletons
 from labeling.video import frame_count, read_frames, read_packet_times
-from pipelines.generate_clips import ClipsRequest, _make
-from pipelines.train import GenerateOptions
+from pipelines.generate_clips import ClipsRequest, _make, show_clips
+from pipelines.train import GenerateOptions, run_generate
 from training.backbone import SamplingSettings
 from training.backbones import load_backbone
 from training.clip_views import clip_trajectory
@@ -34,7 +35,7 @@ from training.ego_recipes import recipe_trajectory
 from training.generation import ClipConditions, ClipGenerator, prepare_conditions, write_samples
 from training.generation import generate as generate_files
 from training.latents import cache_latents
-from training.sampling_inputs import LABEL_WIDTH, control_clip, ego_trajectory, first_skeleton
+from training.sampling_inputs import LABEL_WIDTH, control_clip, ego_trajectory, first_skeleton, object_clip
 from training.trainer import TrainSummary, train
 
 SAMPLE = FakeSample(key="other_0")
@@ -298,6 +299,33 @@ def test_videos_have_the_adapters_frame_rate_whatever_the_backbone_says(tmp_path
     )
     times = read_packet_times(made.control).times_s
     assert len(times) == 9 and np.diff(times) == pytest.approx(np.full(8, 5 / 24), abs=1e-4)
+
+
+def test_an_object_that_enters_late_is_shown_late(tmp_path: Path) -> None:
+    picture = PictureConfig.model_validate(PICTURE | {"frame_step": 2})
+    write_keypoints(tmp_path / "late.parquet", [walker(frame, x=30) for frame in range(10, 17)])
+    video = object_clip(tmp_path / "late.parquet", frames=9, picture=picture)
+    assert video.any((1, 2, 3)).tolist() == [False] * 5 + [True] * 4
+    with pytest.raises(ConfigError, match="first label is in frame 10, but the clip has frames 0 to 8"):
+        object_clip(tmp_path / "late.parquet", frames=5, picture=picture)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"data": Path("job"), "image": Path("a.png")}, "--image would not be used"),
+        ({"data": Path("job"), "image": Path("a.png"), "skeleton": Path("b.png")}, "--image and --skeleton would not"),
+        ({"image": Path("a.png"), "caption": "x", "clip": "v_0"}, "give --data JOB too"),
+    ],
+    ids=["image", "skeleton", "clip"],
+)
+def test_two_things_to_start_from_are_refused(given: Any, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        run_generate(out=Path("out"), motion=Path("m"), appearance=None, **given)
+    if "data" in given:
+        own = {name: given.get(name) for name in ("image", "skeleton")}
+        with pytest.raises(ConfigError, match=words):
+            show_clips(given["data"], ClipsRequest(), out=Path("out"), motion=Path("m"), appearance=None, **own)
 
 
 def test_a_folder_that_cannot_be_written_to_is_a_storage_error(generator, tmp_path: Path) -> None:

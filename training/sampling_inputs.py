@@ -142,15 +142,22 @@ def object_clip(
 ) -> np.ndarray:
     """(T, H, W, 3): an object video from an MP4, or drawn from a Parquet table of labels.
 
+    Labels count from the clip's first frame, so that an object may enter late.
+
     Raises:
-        ConfigError: too short.
+        ConfigError: too short, or labels that all lie behind the clip's last frame.
         VideoError: not a video.
     """
     size = {"width": picture.control_width, "height": picture.control_height}
     if source.suffix == ".parquet":
         labels = read_keypoints(source)
-        start = min((label.frame for label in labels), default=0)
-        span = Span(start=start, end=start + frames * picture.frame_step)
+        span = Span(start=0, end=(frames - 1) * picture.frame_step + 1)
+        first = min((label.frame for label in labels), default=0)
+        if first >= span.end:
+            raise ConfigError(
+                f"{source}: its first label is in frame {first}, but the clip has frames 0 to {span.end - 1}; count "
+                "frames from the clip's first"
+            )
         return np.stack(list(object_frames(labels, clip=span, key=key, variant=variant, **size)))[:: picture.frame_step]
     return control_clip(source, frames=frames, picture=picture)
 
