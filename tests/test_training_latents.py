@@ -23,9 +23,10 @@ from labeling.errors import ConfigError, DataError
 from labeling.skeleton_video import draw_skeletons
 from training import latents as module
 from training.backbones import load_backbone
-from training.config import backbone_config
+from training.config import BACKBONES, backbone_config
 from training.latent_store import LatentStore
 from training.latents import cache_latents, check_store, open_store
+from training.sampling_inputs import LabelledFrame, check_aspect
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +157,9 @@ def test_captions_are_encoded_once_each(tmp_path: Path, backbone, monkeypatch) -
 
 CHANGES: dict[str, Callable[[Any], dict[str, Any]]] = {
     "vae": lambda _: {"backbone": load_backbone(backbone_config("tiny", picture=PICTURE, seed=1))},
-    "picture": lambda _: {"backbone": load_backbone(backbone_config("tiny", picture=PICTURE | {"rgb_width": 128}))},
+    "picture": lambda _: {
+        "backbone": load_backbone(backbone_config("tiny", picture=PICTURE | {"rgb_width": 192, "rgb_height": 128}))
+    },
     "controls": lambda backbone: {"backbone": backbone, "controls": ["hdmap"]},
     "storage": lambda backbone: {"backbone": backbone, "object_variants": 2},
 }
@@ -198,6 +201,23 @@ def test_sizes_are_checked_before_anything_is_spent(tmp_path: Path, picture, fra
     with pytest.raises(ConfigError, match=message):
         cache_latents(tmp_path, backbone_name="tiny", picture=picture, datasets=datasets)
     assert not list(tmp_path.rglob("*.safetensors"))
+
+
+@pytest.mark.parametrize("side", ["control", "rgb"])
+def test_sizes_of_another_aspect_than_the_clips_are_refused(tmp_path: Path, side: str) -> None:
+    """Training would squeeze such a picture, sampling would crop it."""
+    wide = backbone_config("tiny", picture=PICTURE | {f"{side}_width": 128})
+    with pytest.raises(ConfigError, match=r"96x64 \(aspect 1.500\), the backbone's 128x64 \(2.000\)"):
+        cache(tmp_path, load_backbone(wide))
+    assert not list(tmp_path.iterdir())
+    drawn = LabelledFrame(labels=[], width=WIDTH, height=HEIGHT)
+    with pytest.raises(ConfigError, match="squeezed in training and cropped in sampling"):
+        drawn.drawn(wide.picture)
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_presets_have_the_aspect_of_the_jobs_pictures(name: str) -> None:
+    check_aspect(backbone_config(name).picture, width=1056, height=704)
 
 
 def test_what_is_absent_is_named(tmp_path: Path, tiny_job) -> None:  # noqa: F811

@@ -36,6 +36,7 @@ from training.latent_store import (
     read_records,
     text_path,
 )
+from training.sampling_inputs import check_aspect
 from training.stages import EGO, IMAGE, OBJECTS, RGB
 from training.weights import tensor_bytes
 
@@ -96,7 +97,7 @@ def cache_latents(
         datasets: by split; read from the job's shards if not given.
 
     Raises:
-        ConfigError: frame counts or sizes that the backbone does not take.
+        ConfigError: frame counts or sizes that the backbone does not take, or sizes of another aspect than the clips'.
         DataError: a stale cache (both fingerprints are named), no clips.
         StorageError: no space left.
     """
@@ -111,6 +112,8 @@ def cache_latents(
     backbone = backbone or load_backbone(config, device=device)
     clip_frames = len(samples[0][1].cam_to_world)
     manifest = plan_manifest(backbone, clip_frames=clip_frames, controls=controls, object_variants=object_variants)
+    width, height = _picture_size(samples[0][1])
+    check_aspect(config.picture, width=width, height=height)
     with storage_errors(folder):
         _open_store(folder, manifest, refresh=refresh)
         mine = [(split, one) for split, one in samples if int(hashed_share("part", one.key) * part[1]) == part[0]]
@@ -200,13 +203,17 @@ def encode_clip(
     sample: ClipSample, backbone: Backbone, manifest: CacheManifest, *, controls: Sequence[str] = (),
     object_variants: int = 1,
 ) -> dict[str, torch.Tensor]:  # fmt: skip
-    """All latents of one clip by name, in the storage type, and the skeleton's mask as uint8."""
+    """All latents of one clip by name, in the storage type, and the skeleton's mask as uint8.
+
+    Raises:
+        ConfigError: the clip's picture has another aspect than the backbone's.
+    """
     picture = backbone.config.picture.model_copy(update={"frames": manifest.frames})
-    meta = sample.meta
-    size, camera = meta.get("picture", meta), meta.get("intrinsics")
+    camera, (width, height) = sample.meta.get("intrinsics"), _picture_size(sample)
+    check_aspect(picture, width=width, height=height)
     views = ClipViews(
         sample=sample, picture=picture, indices=frame_indices(len(sample.cam_to_world), picture),
-        label_width=int(size.get("width", 1056)), label_height=int(size.get("height", 704)),
+        label_width=width, label_height=height,
         intrinsics=Intrinsics(**camera) if camera else None,
     )  # fmt: skip
     dtype = getattr(torch, backbone.config.latent_dtype)
@@ -222,6 +229,12 @@ def encode_clip(
         # Every cell counts where there are no labels to say which are lit.
         tensors[f"mask_{name}"] = torch.ones(tensors[name].shape[1:], dtype=torch.uint8)
     return {name: tensor.contiguous() for name, tensor in tensors.items()}
+
+
+def _picture_size(sample: ClipSample) -> tuple[int, int]:
+    """Width and height of a clip's picture, which its labels are in."""
+    size = sample.meta.get("picture", sample.meta)
+    return int(size.get("width", 1056)), int(size.get("height", 704))
 
 
 def _videos(

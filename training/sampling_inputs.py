@@ -21,6 +21,8 @@ from training.ego_recipes import recipe_trajectory
 
 LABEL_WIDTH = 1056
 """Extractors look at pictures this wide, whatever the backbone's size."""
+_MOST_STRETCH = 0.01
+"""Of one side against the other: half a pixel in a hundred at the picture's edge."""
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -44,6 +46,30 @@ def covered(picture: np.ndarray, *, width: int, height: int) -> np.ndarray:
     return scaled[plan.crop_y : plan.crop_y + height, plan.crop_x : plan.crop_x + width]
 
 
+def check_aspect(picture: PictureConfig, *, width: int, height: int) -> None:
+    """Refuse sizes of another shape than a clip's.
+
+    Training scales each side of a clip by itself, sampling crops the first frame: that is the same for one shape alone.
+
+    Args:
+        picture: the backbone's sizes.
+        width: of the clip's picture, pixels.
+        height: of the clip's picture, pixels.
+
+    Raises:
+        ConfigError: a size whose aspect is more than 1 % off.
+    """
+    sizes = ((picture.control_width, picture.control_height), (picture.rgb_width, picture.rgb_height))
+    for wide, high in sizes:
+        stretch = wide * height / (high * width)
+        if max(stretch, 1 / stretch) > 1 + _MOST_STRETCH:
+            raise ConfigError(
+                f"the clips' pictures are {width}x{height} (aspect {width / height:.3f}), the backbone's {wide}x{high} "
+                f"({wide / high:.3f}): they would be squeezed in training and cropped in sampling; set picture's sizes "
+                "to the clips' aspect, or cut the job's pictures to the backbone's"
+            )
+
+
 def fitted(frames: np.ndarray, *, width: int, height: int) -> np.ndarray:
     """Control frames (T, H, W, 3) at another size, without mixing their colours."""
     if frames.shape[1:3] == (height, width):
@@ -61,7 +87,12 @@ class LabelledFrame:
     height: int
 
     def drawn(self, picture: PictureConfig) -> np.ndarray:
-        """(H, W, 3) at the controls' size."""
+        """(H, W, 3) at the controls' size.
+
+        Raises:
+            ConfigError: the backbone's pictures have another aspect.
+        """
+        check_aspect(picture, width=self.width, height=self.height)
         return draw_skeletons(
             self.labels, width=picture.control_width, height=picture.control_height, label_width=self.width,
             label_height=self.height,
