@@ -12,6 +12,7 @@ from training_fixtures import one_thread  # noqa: F401
 
 from labeling.errors import ModelError
 from training.adapters import (
+    DIFFUSERS_METADATA,
     activate_adapter,
     adapter_bytes,
     adapter_names,
@@ -144,6 +145,22 @@ def test_alpha_tensors_are_honoured(tmp_path: Path) -> None:
     assert read_adapter(tmp_path / "a.safetensors").alpha == 2
     (tmp_path / "a.safetensors").rename(tmp_path / "adapter.safetensors")
     assert read_adapter(tmp_path).alpha == 2, "the folder that training wrote stands for the adapter in it"
+
+
+@pytest.mark.parametrize("settings", [{"use_rslora": True}, {"alpha_pattern": {"to_q": 8}}, None], ids=str)
+def test_adapters_of_another_scale_are_refused(tmp_path: Path, settings: dict[str, Any] | None) -> None:
+    """Loaded as a plain LoRA, such an adapter would act too weakly or too strongly, and nothing would say so."""
+    lora, _ = adapter_state(filled(tiny_transformer(), "x", AdapterConfig(rank=4, alpha=4)), "x")
+    tensors = {f"transformer.{key}": tensor for key, tensor in lora.items()}
+    told = {"r": 4, "lora_alpha": 4, "use_rslora": False, "rank_pattern": {}, "alpha_pattern": {}, **(settings or {})}
+    metadata = {DIFFUSERS_METADATA: json.dumps({f"transformer.{key}": value for key, value in told.items()})}
+    if settings is None:
+        modules = sorted({key.split(".lora_")[0] for key in lora})
+        tensors |= {f"transformer.{one}.alpha": torch.tensor(float(place)) for place, one in enumerate(modules, 1)}
+        metadata = {}
+    save_file(tensors, tmp_path / "a.safetensors", metadata=metadata)
+    with pytest.raises(ModelError, match=next(iter(settings), "alphas") if settings else "alphas"):
+        load_adapter(tiny_transformer(), tmp_path / "a.safetensors", "motion")
 
 
 def test_only_the_adapter_is_trainable_and_in_float32() -> None:

@@ -26,6 +26,8 @@ from training.weights import tensor_bytes
 
 DIFFUSERS_METADATA, OUR_METADATA = "lora_adapter_metadata", "animatic"
 EXTRA_PREFIX = "extra."
+_SPECIAL = ("use_rslora", "use_dora", "alpha_pattern")
+"""Settings of PEFT under which a LoRA's scale is not alpha / rank throughout."""
 _PREFIXES = ("base_model.model.", "transformer.", "unet.", "diffusion_model.", "model.")
 _RENAMED = {".lora_down.": ".lora_A.", ".lora_up.": ".lora_B.", ".lora.down.": ".lora_A.", ".lora.up.": ".lora_B."}
 
@@ -166,7 +168,8 @@ def read_adapter(path: Path) -> AdapterFile:
     Alpha comes from the metadata, else from ``.alpha`` tensors, else it equals the rank.
 
     Raises:
-        ModelError: missing, not safetensors, or without a LoRA in it.
+        ModelError: missing, not safetensors, without a LoRA in it, or one of a kind that would act at another scale:
+            rank-stabilised, DoRA, alphas that differ from module to module.
     """
     path = path / "adapter.safetensors" if path.is_dir() else path
     with _opened(path) as file:
@@ -182,9 +185,15 @@ def read_adapter(path: Path) -> AdapterFile:
             "lora_A / lora_B pairs are expected"
         )
     rank = ranks.pop()
-    alpha = _metadata_alpha(metadata)
-    if alpha is None:
-        alpha = alphas.pop() if len(alphas) == 1 else float(rank)
+    settings = _settings(metadata)
+    special = [name for name in _SPECIAL if settings.get(name)]
+    if special or len(alphas) > 1:
+        found = special or [f"alphas {sorted(alphas)}"]
+        raise ModelError(
+            f"{path} is no plain LoRA: it has {', '.join(found)}, and would act at another scale than it was trained "
+            "at; one alpha for all modules, and the scale alpha / rank, are expected"
+        )
+    alpha = float(settings["lora_alpha"]) if "lora_alpha" in settings else alphas.pop() if alphas else float(rank)
     targets = tuple(sorted({key.split(".lora_")[0] for key in tensors}))
     about = _about(metadata)
     return AdapterFile(tensors=tensors, extra=extra, rank=rank, alpha=alpha, targets=targets, about=about)
@@ -227,12 +236,10 @@ def _plain_key(key: str) -> str:
     return f"{head}.lora_{tail[0]}.weight" if head and tail.endswith(".weight") else key
 
 
-def _metadata_alpha(metadata: Mapping[str, str]) -> float | None:
+def _settings(metadata: Mapping[str, str]) -> dict[str, Any]:
+    """PEFT's settings in diffusers' metadata, without the model's name before each."""
     settings = json.loads(metadata.get(DIFFUSERS_METADATA, "{}"))
-    for key, value in settings.items():
-        if key.split(".")[-1] == "lora_alpha":
-            return float(value)
-    return None
+    return {key.split(".")[-1]: value for key, value in settings.items()}
 
 
 def load_adapter(denoiser: torch.nn.Module, path: Path, name: str) -> AdapterFile:
