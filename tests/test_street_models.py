@@ -228,7 +228,7 @@ def test_a_training_that_stopped_goes_on_to_the_same_weights(toy_pool: StreetPoo
             raise KeyboardInterrupt
         return batches(rng)
 
-    def train(make_batch, checkpoint: Path | None) -> torch.nn.Module:
+    def train(make_batch, checkpoint: Path | None, settings: FitSettings = settings) -> torch.nn.Module:
         torch.manual_seed(3)
         network = FieldNetwork(("lane24",), widths=(8, 8, 8, 8, 8), width=8)
         return fit(network, make_batch, field_batch_loss, settings, checkpoint=checkpoint)
@@ -236,6 +236,9 @@ def test_a_training_that_stopped_goes_on_to_the_same_weights(toy_pool: StreetPoo
     with pytest.raises(KeyboardInterrupt):
         train(stopping, tmp_path / "state.pt")
     assert (tmp_path / "state.pt").is_file()
+    for other in (replace(settings, steps=8), replace(settings, seed=4)):
+        with pytest.raises(ModelError, match="stopped in a training of 6 steps with seed 3"):
+            train(batches, tmp_path / "state.pt", other)
     resumed, whole = train(batches, tmp_path / "state.pt"), train(batches, None)
     for one, other in zip(resumed.state_dict().values(), whole.state_dict().values(), strict=True):
         assert torch.equal(one, other)

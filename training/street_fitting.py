@@ -66,7 +66,7 @@ def fit(
             there already, training goes on from it, and ends with the same weights as without a pause.
 
     Raises:
-        ModelError: the checkpoint is that of a finished training of another length.
+        ModelError: the checkpoint is that of a training of another length or seed.
     """
     if checkpoint and is_finished(checkpoint, settings.steps):
         return load_finished(network, checkpoint)
@@ -77,7 +77,7 @@ def fit(
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=(0.9, 0.99)
     )
-    state = _State(network=network, average=average, optimiser=optimiser)
+    state = _State(network=network, average=average, optimiser=optimiser, settings=settings)
     first = state.load(checkpoint, settings.device) if checkpoint and checkpoint.is_file() else 0
     device = torch.device(settings.device)
     precision = settings.precision or best_precision(device)
@@ -168,16 +168,28 @@ class _State:
     network: nn.Module
     average: nn.Module
     optimiser: torch.optim.Optimizer
+    settings: FitSettings
 
     def save(self, path: Path, steps: int) -> None:
         parts = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
-        _save({"steps": steps} | {name: part.state_dict() for name, part in parts.items()}, path)
+        _save({"steps": steps, **self._run()} | {name: part.state_dict() for name, part in parts.items()}, path)
+
+    def _run(self) -> dict[str, int]:
+        """What batches and rates depend on: a state of another run is not gone on from."""
+        return {"seed": self.settings.seed, "of_steps": self.settings.steps}
 
     def load(self, path: Path, device: str) -> int:
         """Steps done."""
         kept = torch.load(path, weights_only=True, map_location=device)
         if "steps" not in kept:
             raise ModelError(f"{path}: finished after {kept['finished']} steps; remove it to train for another length")
+        # States of older versions do not tell.
+        other = {name: kept[name] for name, value in self._run().items() if kept.get(name, value) != value}
+        if other:
+            raise ModelError(
+                f"{path}: stopped in a training of {kept['of_steps']} steps with seed {kept['seed']}, this one is of "
+                f"{self.settings.steps} with seed {self.settings.seed}; remove it to start afresh"
+            )
         self.network.load_state_dict(kept["network"])
         self.average.load_state_dict(kept["average"])
         self.optimiser.load_state_dict(kept["optimiser"])
