@@ -274,6 +274,15 @@ def test_torn_checkpoints_are_skipped_with_a_warning_and_the_last_n_are_kept(tmp
         assert newest_checkpoint(tmp_path) is None
 
 
+@pytest.mark.parametrize(("keep", "kept"), [(1, [3]), (2, [3, 9]), (3, [3, 8, 9])])
+def test_the_checkpoint_just_written_is_never_pruned(tmp_path: Path, keep: int, kept: list[int]) -> None:
+    """A run that goes on from step 2 writes step 3 beside the 8 and 9 of the run before."""
+    for step in (7, 8, 9):
+        save_checkpoint(tmp_path, step, {"a": b"x"}, keep=3)
+    save_checkpoint(tmp_path, 3, {"a": b"x"}, keep=keep)
+    assert [int(path.name[-8:]) for path in list_checkpoints(tmp_path)] == kept
+
+
 def test_a_save_that_fails_leaves_earlier_checkpoints_whole(tmp_path: Path, monkeypatch) -> None:
     from labeling.errors import StorageError
     from training import checkpoints
@@ -337,7 +346,12 @@ def test_validation_videos_are_written(tiny_job: Path, tmp_path: Path) -> None: 
     from labeling.video import frame_count
 
     config = tiny_config("motion", validation={"videos_every_steps": 2, "sampling_steps": 2})
-    run(config, tiny_job, tmp_path)
+    backbone = load_backbone(config.backbone)
+    released: list[str] = []
+    release = backbone.release
+    backbone.release = lambda parts: (released.extend(parts), release(parts))[1]  # type: ignore[method-assign]
+    run(config, tiny_job, tmp_path, backbone=backbone)
+    assert released == ["vae"] * 3, "before the first step, and after the videos of steps 2 and 4"
     videos, sheets = (sorted((tmp_path / "validation").glob(f"*.{kind}")) for kind in ("mp4", "png"))
     assert [path.stem for path in videos] == ["step_00000002_other_0", "step_00000004_other_0"]
     assert frame_count(videos[0]) == 9

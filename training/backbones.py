@@ -14,7 +14,7 @@ def load_backbone(config: BackboneConfig, *, device: str | torch.device = "cpu",
     Args:
         config: what to load and from where.
         device: where its networks go.
-        parts: of ``denoiser``, ``vae``, ``text``; empty means all. A part that was left out loads when first used.
+        parts: of ``denoiser``, ``vae``, ``text``: loaded now. Every other one loads when it is first used.
 
     Raises:
         ModelError: weights that are absent or do not fit.

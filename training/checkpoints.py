@@ -26,7 +26,7 @@ def checkpoint_folder(root: Path, step: int) -> Path:
 
 
 def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes | dict[str, torch.Tensor]], *, keep: int) -> Path:
-    """Write a checkpoint and drop all but the newest ``keep``.
+    """Write a checkpoint and drop all but the newest ``keep``, this one always among them.
 
     Args:
         root: folder of the checkpoints.
@@ -54,7 +54,7 @@ def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes | dict[str,
             sync_folder(root)
         finally:
             shutil.rmtree(staged, ignore_errors=True)
-        _prune(root, keep=keep)
+        _prune(root, keep=keep, written=goal)
     return goal
 
 
@@ -73,8 +73,10 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _prune(root: Path, *, keep: int) -> None:
-    for path in list_checkpoints(root)[:-keep]:
+def _prune(root: Path, *, keep: int, written: Path) -> None:
+    # A run that went on from an older checkpoint has written one that is not the newest by its step.
+    others = [path for path in list_checkpoints(root) if path != written]
+    for path in others[: max(0, len(others) + 1 - keep)]:
         shutil.rmtree(path, ignore_errors=True)
     for leftover in root.glob(".step_*"):
         shutil.rmtree(leftover, ignore_errors=True)

@@ -87,6 +87,8 @@ def write_validation_videos(
             stem.parent.mkdir(parents=True, exist_ok=True)
             paths += [_write_pair(stem.with_suffix(".mp4"), truth, sample, fps=store.fps)]
             paths += [_write_sheet(stem.with_suffix(".png"), truth, sample)]
+    # Else it would stay on the device, which is full when training goes on.
+    backbone.release(["vae"])
     return paths
 
 
