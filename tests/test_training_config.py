@@ -6,7 +6,7 @@ import pytest
 from training_fixtures import one_thread  # noqa: F401
 
 from labeling.errors import ConfigError
-from training.config import backbone_config, config_names, load_config
+from training.config import TrainConfig, backbone_config, config_names, load_config
 from training.dry_run import plan_run
 from training.trainer import train
 
@@ -103,6 +103,14 @@ def test_dry_run_needs_neither_data_nor_weights_and_says_all(tmp_path: Path) -> 
     for part in ("763.4 M", "6,144", "1.92 B", "GiB", "1,800 steps per hour, 5.0 h", "288,000 samples"):
         assert part in text
     assert not (tmp_path / "out").exists()
+
+
+def test_a_plan_of_own_weights_needs_their_size() -> None:
+    own = {"backbone": {"name": "mine", "kind": "ltx", "weights": "/w/ltx"}, "optimiser": {"steps": 10}}
+    with pytest.raises(ConfigError, match="does not say how large /w/ltx is.*backbone.size to 2b or 13b"):
+        plan_run(TrainConfig.model_validate({"stage": "motion", **own}))
+    own["backbone"]["size"] = "2b"
+    assert plan_run(TrainConfig.model_validate({"stage": "motion", **own})).base_parameters > 1e9
 
 
 def test_dry_run_memory_follows_the_knobs() -> None:

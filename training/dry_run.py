@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from labeling.errors import ConfigError
 from training.backbone import LatentGeometry
 from training.config import TrainConfig
 from training.flow import shift_for_tokens
@@ -85,7 +86,7 @@ def plan_run(config: TrainConfig, *, steps_per_second: float | None = None) -> R
     """The plan of a recipe; loads nothing.
 
     Raises:
-        ConfigError: frame counts or sizes that the backbone does not take.
+        ConfigError: frame counts or sizes that the backbone does not take, or weights whose size is not told.
     """
     denoiser, geometry, hidden, layers = _meta_network(config)
     base = sum(weight.numel() for weight in denoiser.parameters())
@@ -124,6 +125,11 @@ def _meta_network(config: TrainConfig) -> tuple[torch.nn.Module, LatentGeometry,
     from training.ltx import TRANSFORMERS
     from training.tiny import TINY_TRANSFORMER
 
+    if config.backbone.kind == "ltx" and "size" not in config.backbone.model_fields_set:
+        raise ConfigError(
+            f"backbone {config.backbone.name} does not say how large {config.backbone.weights} is, and a plan loads no "
+            f"weights; set backbone.size to {' or '.join(TRANSFORMERS)}"
+        )
     settings: dict[str, Any] = (
         TINY_TRANSFORMER if config.backbone.size == "tiny" else TRANSFORMERS[config.backbone.size]
     )
