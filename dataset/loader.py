@@ -1,4 +1,4 @@
-"""Reading shards back: a map-style dataset over the index, and an order of samples that can be resumed.
+"""Reading shards back: a map-style dataset over the index.
 
 Every read is one seek, so nothing is unpacked, workers share no state, and any sample can be had at any time.
 """
@@ -121,47 +121,3 @@ class ShardDataset:
         """sha256 over keys and members: what a cache of this split depends on."""
         lines = [f"{row.key}.{row.member} {row.sha256}" for key in self.keys for row in self._members[key].values()]
         return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()
-
-
-class ShuffledOrder:
-    """An endless order of sample indices: each epoch a permutation, keyed by (seed, epoch), that can be resumed.
-
-    Ranks share one order and take every ``world_size``-th index, so the order does not depend on their number.
-    """
-
-    def __init__(self, count: int, *, seed: int = 0, rank: int = 0, world_size: int = 1) -> None:
-        if count < 1:
-            raise DataError("there are no samples to put in order; `animatic status` says what was dropped and why")
-        self._count, self._seed = count, seed
-        self._rank, self._world_size = rank, world_size
-        self._position = 0
-        self._epoch, self._permutation = -1, np.zeros(0, dtype=np.int64)
-
-    def __iter__(self) -> Iterator[int]:
-        return self
-
-    def __next__(self) -> int:
-        place = self._position * self._world_size + self._rank
-        self._position += 1
-        epoch, index = divmod(place, self._count)
-        if epoch != self._epoch:
-            self._epoch = epoch
-            self._permutation = np.random.default_rng([self._seed, epoch]).permutation(self._count)
-        return int(self._permutation[index])
-
-    def state_dict(self) -> dict[str, int]:
-        """Where it stands: what ``load_state_dict`` takes."""
-        return {"position": self._position, "seed": self._seed, "count": self._count}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on from where another order stood.
-
-        Raises:
-            DataError: it was over other samples or another seed.
-        """
-        if (state["seed"], state["count"]) != (self._seed, self._count):
-            raise DataError(
-                f"the order was saved for {state['count']} samples with seed {state['seed']}, this one has "
-                f"{self._count} with seed {self._seed}; start afresh or use the same data"
-            )
-        self._position = state["position"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pipeline_fixtures import HEIGHT, WIDTH
 
-from dataset.loader import ShardDataset, ShuffledOrder
+from dataset.loader import ShardDataset
 from dataset.shards import ShardPlan, write_shard, write_shard_index
 from dataset.tables import write_keypoints
 from labeling.encoding import EncoderSettings, VideoWriter
@@ -86,29 +86,3 @@ def test_what_is_not_there_is_named(shards, tmp_path):
 def test_the_fingerprint_follows_the_content(shards):
     assert ShardDataset(shards).fingerprint == ShardDataset(str(shards)).fingerprint
     assert ShardDataset(shards).fingerprint != ShardDataset(shards, "val").fingerprint
-
-
-@pytest.mark.parametrize("world_size", [1, 2, 3])
-def test_an_epoch_sees_every_sample_once_whatever_the_number_of_ranks(world_size):
-    orders = [ShuffledOrder(12, seed=3, rank=rank, world_size=world_size) for rank in range(world_size)]
-    dealt = [next(orders[place % world_size]) for place in range(36)]
-    single = ShuffledOrder(12, seed=3)
-    assert dealt == [next(single) for _ in range(36)]
-    for epoch in range(3):
-        assert sorted(dealt[12 * epoch : 12 * epoch + 12]) == list(range(12))
-    assert dealt[:12] != dealt[12:24]
-
-
-def test_an_order_goes_on_where_it_stood():
-    order = ShuffledOrder(7, seed=1)
-    for _ in range(9):
-        next(order)
-    state = json.loads(json.dumps(order.state_dict()))
-    rest = [next(order) for _ in range(10)]
-    resumed = ShuffledOrder(7, seed=1)
-    resumed.load_state_dict(state)
-    assert [next(resumed) for _ in range(10)] == rest
-    with pytest.raises(DataError, match="start afresh"):
-        ShuffledOrder(8, seed=1).load_state_dict(state)
-    with pytest.raises(DataError, match="no samples"):
-        ShuffledOrder(0)
