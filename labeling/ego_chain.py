@@ -11,6 +11,9 @@ from labeling.ego_smoothing import smoothed
 from labeling.ego_speed import LengthEvidence
 from labeling.ego_steps import FORWARD, Step
 
+_SURE_SIGMAS = 2.0
+"""A change of speed of that many of its sigmas is believed by half."""
+
 
 def moves(steps: list[Step | None], states: np.ndarray, cuts: np.ndarray) -> np.ndarray:
     """(m,) bool: steps with a length; held steps move on if the last one seen did."""
@@ -84,19 +87,35 @@ def length_evidence(
     for index, (step, here, road) in enumerate(zip(steps, depths, roads, strict=True)):
         if step is None or here is None or road is None or not moving[index]:
             continue
-        window_s = max(step.window_s, 1e-4)
-        found, road_sigma[index] = step_in_heights(road, pitch_rad)
-        heights[index] = found / window_s
+        heights[index], road_sigma[index] = step_in_heights(road, pitch_rad)
         before = depths[index - 1]
         if before is not None and moving[index - 1]:
             lengths, ratio_sigma[index] = length_ratio(before, here, directions[index - 1])
             ratio[index] = lengths * elapsed[index - 1] / max(elapsed[index], 1e-4)
         if len(here.ids):
             depth[index] = max(float(np.median(here.inverse_depth)), 1e-4) / max(elapsed[index], 1e-4)
+    reaches = np.array([step.reach if step else 0 for step in steps], int)
+    heights /= _measured_s(elapsed, ratio, ratio_sigma, reaches)
     return LengthEvidence(
         elapsed_s=elapsed, heights_per_s=heights, road_sigma=road_sigma, ratio=ratio, ratio_sigma=ratio_sigma,
         depth_per_s=depth,
     )  # fmt: skip
+
+
+def _measured_s(elapsed_s: np.ndarray, ratio: np.ndarray, ratio_sigma: np.ndarray, reaches: np.ndarray) -> np.ndarray:
+    """(m,) what the length that a step measures is divided by to give the step's own speed.
+
+    A window's length is the sum of its steps', and those differ: each counts as long as the middle step would take
+    for it. Where pictures have been dropped and the rest shown at an even rate, the window's duration would call each
+    middle step as fast as its neighbours, and ratios and road would contradict each other.
+    """
+    # A change that may be noise is taken for none: at a crawl the longest windows would add up the most of it.
+    change = np.log(np.maximum(ratio, 1e-6))
+    doubt = np.minimum(_SURE_SIGMAS * ratio_sigma / np.maximum(np.abs(change), 1e-9), 1e6)
+    logs = np.cumsum(change / (1.0 + doubt**4))
+    spans = [slice(index - reach, index + reach + 1) for index, reach in enumerate(reaches)]
+    measured = [np.exp(logs[span] - logs[index]) @ elapsed_s[span] for index, span in enumerate(spans)]
+    return np.maximum(np.array(measured), 1e-4)
 
 
 def chained(rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:

@@ -32,8 +32,8 @@ class Step:
     window: PairMotion | None
     """Fit over several steps around this one, where its own parallax is short."""
     window_corners: Corners | None
-    window_s: float
-    """Duration of what measures length: the window's, or the step's own."""
+    reach: int = 0
+    """Steps on either side that the window takes in; 0 without one."""
 
     @property
     def measured(self) -> tuple[PairMotion, Corners]:
@@ -132,7 +132,7 @@ class StepSolver:
                 axis, axis_sigma = pair.axis, pair.axis_sigma
             if best == 2:
                 self._remember(corners, pair)
-            steps[index] = Step(corners=corners, pair=pair, window=None, window_corners=None, window_s=elapsed)
+            steps[index] = Step(corners=corners, pair=pair, window=None, window_corners=None)
         return [self._widened(steps, cuts, index) for index in range(count)], cuts
 
     def _remember(self, corners: Corners, pair: PairMotion) -> None:
@@ -166,10 +166,10 @@ class StepSolver:
             corners = self._shared(first, last)
             if corners is None or len(corners.ids) < 0.4 * len(step.corners.ids):
                 continue
-            return self._with_window(step, [one for one in inside if one is not None], corners, (first, last))
+            return self._with_window(step, [one for one in inside if one is not None], corners)
         return step
 
-    def _with_window(self, step: Step, inside: list[Step], corners: Corners, span: tuple[int, int]) -> Step:
+    def _with_window(self, step: Step, inside: list[Step], corners: Corners) -> Step:
         turns = [one.pair.rotation if one.pair.costs.argmin() == 2 else one.pair.turn for one in inside]
         rotation, half_turn = np.eye(3), np.eye(3)
         for place, turn in enumerate(turns):
@@ -180,10 +180,7 @@ class StepSolver:
         # The chord's direction in the last frame, turned back to the frame that this step ends in.
         axis = half_turn.T @ window.axis
         pair = self._explain(step.corners, turns[len(turns) // 2], axis, max(window.axis_sigma, 2e-3), restarts=False)
-        return Step(
-            corners=step.corners, pair=pair, window=window, window_corners=corners,
-            window_s=float(self._times[span[1]] - self._times[span[0]]),
-        )  # fmt: skip
+        return Step(corners=step.corners, pair=pair, window=window, window_corners=corners, reach=len(inside) // 2)
 
     def _shared(self, first: int, last: int) -> Corners | None:
         before, after = self._tracks.frames[self._kept[first]], self._tracks.frames[self._kept[last]]

@@ -145,6 +145,18 @@ def test_repeated_frames_are_bridged():
     assert np.sqrt(np.mean((speeds - 8.0) ** 2)) < 0.8
 
 
+@pytest.mark.parametrize("speed", [2.0, 8.0], ids=str)
+def test_dropped_pictures_under_even_times_leave_the_metres(speed):
+    """30 pictures a second shown as 24 by dropping every fifth: every fourth step is twice as long as the others."""
+    speeds = np.full(FRAMES, speed)
+    speeds[::4] *= 2
+    truth = driven(speeds)
+    motion = solved(truth)
+    found, true = (np.linalg.norm(steps(poses)[:, :3, 3], axis=1) for poses in (motion.trajectory.cam_to_world, truth))
+    assert found.sum() == pytest.approx(true.sum(), rel=0.01)
+    assert np.sqrt(np.mean((found - true) ** 2)) < 0.02 * true.mean()
+
+
 def test_equal_source_times_give_increasing_output_times():
     truth = driven(np.full(20, 8.0))
     source = tracks_of(truth)
