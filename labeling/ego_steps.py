@@ -21,6 +21,7 @@ FORWARD = np.array([0.0, 0.0, -1.0])
 _WIDEST_AXIS = 0.35
 _OVERLAY_CELL = 16
 _DOUBT_GAIN = 0.35
+_LEAST_REPEATS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,13 +48,14 @@ def shown_frames(tracks: RunTracks) -> tuple[np.ndarray, np.ndarray]:
     """(m,) indices of frames that show something new, and (m,) the times at which their pictures were taken.
 
     A repeated picture is left out when its neighbours move (a standing camera repeats itself too, and says so). Where
-    repeats come regularly, as in 20 pictures a second stretched to 24, the pictures are spread evenly again.
+    repeats come regularly, as in 20 pictures a second stretched to 24, the pictures are spread evenly again; one or two
+    that a recorder showed twice say nothing of the others' times.
     """
     times = tracks.times_s
     flow = _median_flow(tracks)
     same_time = np.diff(times, prepend=-np.inf) == 0
     left_out = same_time.copy()
-    stretched = False
+    stretched = 0
     for index in np.flatnonzero([frame.repeated for frame in tracks.frames] | (flow < 0.1)):
         if left_out[index] or tracks.frames[index].cut or index == 0:
             continue
@@ -63,10 +65,11 @@ def shown_frames(tracks: RunTracks) -> tuple[np.ndarray, np.ndarray]:
         if sides and all(sides):
             left_out[index] = True
             usual = np.median(np.concatenate([before, after]))
-            stretched |= len(after) == 0 or after[0] < 1.6 * max(usual, 1e-6)
+            # After a picture shown in place of one that is lost, the next step is two long; nothing follows the last.
+            stretched += len(after) > 0 and after[0] < 1.6 * max(usual, 1e-6)
     kept = np.flatnonzero(~left_out)
     taken = times[kept].astype(np.float64)
-    return kept, _evenly_spread(taken) if stretched else taken
+    return kept, _evenly_spread(taken) if stretched >= _LEAST_REPEATS else taken
 
 
 def _median_flow(tracks: RunTracks) -> np.ndarray:

@@ -1,11 +1,14 @@
 """Ego-motion on made-up streets with exact truth, on KITTI, and on input that shows nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ego_fixtures import camera, driven, tracks_of
 
 from labeling.camera import Intrinsics, invert, read_kitti, rotation_angle_deg
 from labeling.ego_motion import EgoSettings, estimate_ego_motion, solve_run
+from labeling.ego_steps import shown_frames
 from labeling.errors import DataError
 from labeling.video import read_frames
 
@@ -155,6 +158,25 @@ def test_dropped_pictures_under_even_times_leave_the_metres(speed):
     found, true = (np.linalg.norm(steps(poses)[:, :3, 3], axis=1) for poses in (motion.trajectory.cam_to_world, truth))
     assert found.sum() == pytest.approx(true.sum(), rel=0.01)
     assert np.sqrt(np.mean((found - true) ** 2)) < 0.02 * true.mean()
+
+
+@pytest.mark.parametrize("at", [20, FRAMES - 1], ids=["once", "the last"])
+def test_one_repeated_picture_leaves_the_times_of_a_run(at):
+    source = tracks_of(driven(np.full(FRAMES, 8.0)))
+    times = np.ceil(np.arange(FRAMES) / 24 * 30 - 0.5) / 30
+    frames = (*source.frames[:at], *source.frames[at - 1 : -1])
+    kept, taken = shown_frames(replace(source, times_s=times, frames=frames))
+    assert len(kept) == FRAMES - 1
+    assert np.array_equal(taken, times[kept])
+
+
+def test_repeats_that_come_regularly_are_spread_evenly():
+    source = tracks_of(driven(np.full(40, 8.0), fps=20.0))
+    shown = np.arange(48) * 20 // 24
+    frames = tuple(source.frames[index] for index in shown)
+    kept, taken = shown_frames(replace(source, times_s=np.arange(48) / 24, frames=frames))
+    assert len(kept) == 40
+    assert np.diff(taken)[8:-8] == pytest.approx(1 / 20, abs=1 / 200)
 
 
 def test_equal_source_times_give_increasing_output_times():
