@@ -28,7 +28,7 @@ class TrackSettings(BaseModel):
     quality: float = Field(default=2e-4, gt=0)
     """Least smaller eigenvalue of a corner's gradient matrix, for grey values 0 to 1."""
     dark_level: float = Field(default=50.0, ge=0)
-    """Mean grey (0 to 255) below which contrast is equalised."""
+    """Mean grey (0 to 255) below which contrast is equalised, of a picture and the one it is compared with alike."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,6 +59,8 @@ class CornerTracker:
         self.width, self.height = max(16, round(source[0] * scale)), max(16, round(source[1] * scale))
         self._box_scale = np.array([self.width / source[0], self.height / source[1]] * 2)
         self._previous: np.ndarray | None = None
+        self._seen: np.ndarray | None = None
+        self._dark = False
         self._thumbnail = np.zeros(_THUMBNAIL[::-1], np.uint8)
         self._ids = np.zeros(0, np.int64)
         self._points = np.zeros((0, 2), np.float32)
@@ -75,23 +77,24 @@ class CornerTracker:
         repeated = (
             not restart and self._previous is not None and (repeated or _same_picture(thumbnail, self._thumbnail))
         )
-        grey = self._equalised(grey, level)
+        dark = level < self._settings.dark_level
+        seen = _equalised(grey) if dark else grey
         allowed = self._allowed(boxes_xyxy)
         back = np.zeros(len(self._ids), np.float32)
         cut = restart
         if self._previous is not None and not restart and len(self._ids):
             before = len(self._ids)
-            back = self._follow(self._previous, grey, allowed)
+            back = self._follow(self._previous_seen(dark), seen, allowed)
             lost = before >= _LEAST_CORNERS and len(self._ids) < 0.2 * before
             cut = lost and self._scene_changes(thumbnail)
         if cut:
             back = self._forget()
-        added = self._replenish(grey, allowed)
+        added = self._replenish(seen, allowed)
         # What shows nothing is no new scene: the old one may come back.
         cut = restart or (cut and added >= _LEAST_CORNERS)
         change = np.abs(thumbnail.astype(np.int16) - self._thumbnail).mean()
         self._usual_change += 0.2 * (float(change) - self._usual_change)
-        self._previous, self._thumbnail = grey, thumbnail
+        self._previous, self._seen, self._dark, self._thumbnail = grey, seen, dark, thumbnail
         return FrameTracks(
             ids=self._ids.copy(), points_px=self._points.copy(),
             forward_backward_px=np.concatenate([back, np.zeros(added, np.float32)]),
@@ -113,10 +116,12 @@ class CornerTracker:
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
         return picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
 
-    def _equalised(self, grey: np.ndarray, level: float) -> np.ndarray:
-        if level >= self._settings.dark_level:
-            return grey
-        return cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey)
+    def _previous_seen(self, dark: bool) -> np.ndarray:
+        """The last picture, equalised as the new one is: no corner survives a change of contrast by a factor."""
+        assert self._previous is not None and self._seen is not None
+        if dark == self._dark:
+            return self._seen
+        return _equalised(self._previous) if dark else self._previous
 
     def _allowed(self, boxes_xyxy: np.ndarray) -> np.ndarray:
         allowed = np.full((self.height, self.width), 255, np.uint8)
@@ -200,6 +205,10 @@ class CornerTracker:
             return np.zeros((len(new), 2), np.float32)
         distance = ((new[:, None] - self._points[None, :old]) ** 2).sum(axis=-1)
         return self._flow[distance.argmin(axis=1)]
+
+
+def _equalised(grey: np.ndarray) -> np.ndarray:
+    return cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey)
 
 
 def _same_picture(thumbnail: np.ndarray, before: np.ndarray) -> bool:

@@ -90,6 +90,15 @@ def test_a_dark_picture_still_has_corners():
     assert min(len(frame.ids) for frame in tracks.frames) > 50
 
 
+def test_corners_outlive_a_level_that_hovers_where_contrast_is_equalised():
+    pictures = panned(8)
+    base = SETTINGS.dark_level / np.mean(pictures[0])
+    dusk = [(picture * base * (1.04 if at % 2 else 0.96)).astype(np.uint8) for at, picture in enumerate(pictures)]
+    tracks = track_run(dusk, np.arange(8) / 24, settings=SETTINGS)
+    shared = [len(matched(*pair)[0]) for pair in zip(tracks.frames[:-1], tracks.frames[1:], strict=True)]
+    assert min(shared) > 80
+
+
 def test_the_same_pictures_give_the_same_corners():
     one, other = (track_run(panned(4), np.arange(4) / 24, settings=SETTINGS) for _ in range(2))
     assert all(np.array_equal(a.points_px, b.points_px) for a, b in zip(one.frames, other.frames, strict=True))
