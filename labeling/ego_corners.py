@@ -92,8 +92,9 @@ class CornerTracker:
         added = self._replenish(seen, allowed)
         # What shows nothing is no new scene: the old one may come back.
         cut = restart or (cut and added >= _LEAST_CORNERS)
-        change = np.abs(thumbnail.astype(np.int16) - self._thumbnail).mean()
-        self._usual_change += 0.2 * (float(change) - self._usual_change)
+        if self._previous is not None and not restart:
+            change = np.abs(thumbnail.astype(np.int16) - self._thumbnail).mean()
+            self._usual_change += 0.2 * (float(change) - self._usual_change)
         self._previous, self._seen, self._dark, self._thumbnail = grey, seen, dark, thumbnail
         return FrameTracks(
             ids=self._ids.copy(), points_px=self._points.copy(),

@@ -56,6 +56,16 @@ def test_a_cut_is_found_where_it_is():
     assert not set(tracks.frames[3].ids) & set(tracks.frames[4].ids)
 
 
+@pytest.mark.parametrize("breaks", [set(), {3}], ids=["of the run", "after a break"])
+def test_a_cut_is_found_in_the_first_frames(breaks):
+    """Nothing comes before a run's first picture, so that it is no measure of how much pictures change."""
+    before = panned(3, seed=4) if breaks else []
+    after = [(picture * 0.75).astype(np.uint8) for picture in panned(3, seed=2)]
+    pictures = [*before, *panned(2), *after]
+    tracks = track_run(pictures, np.arange(len(pictures)) / 24, breaks=breaks, settings=SETTINGS)
+    assert [index for index, frame in enumerate(tracks.frames) if frame.cut] == [*breaks, len(before) + 2]
+
+
 def test_a_given_break_restarts_the_corners():
     tracks = track_run(panned(4), np.arange(4) / 24, breaks={2}, settings=SETTINGS)
     assert tracks.frames[2].cut
