@@ -180,7 +180,7 @@ def select_clips(
         rule_digest: of the rule and of how objects were counted.
         previous: the selection so far.
         mode: ``auto`` extends a selection that was made by the same rule and makes a new one otherwise; ``extend``
-            applies the frozen threshold whatever the rule says now; ``refreeze`` makes a new one.
+            does the former or fails; ``refreeze`` makes a new one.
 
     Raises:
         ConfigError: ``extend`` without a selection or after the rule has changed, or a split that lacks a video.
@@ -195,10 +195,14 @@ def select_clips(
     free = [row for rows in candidates.values() for row in rows if row.kept]
     threshold = object_threshold([row.objects for row in free if row.objects is not None], rule.keep_share)
     cutoff = _sample_cutoff([row for row in free if _enough(row, threshold)], rule)
-    splits = video_splits(list(candidates), rule)
-    rows = [_judged(row, threshold, cutoff, rule.seed, splits) for rows in candidates.values() for row in rows]
+    rows = [_judged(row, threshold, cutoff, rule.seed) for rows in candidates.values() for row in rows]
+    splits = video_splits(list(candidates), rule, kept={row.video_id for row in rows if row.kept})
     return Selection(
-        rows=_ordered(rows), threshold=threshold, sample_cutoff=cutoff, digests=dict(digests), rule_digest=rule_digest
+        rows=_ordered(_split(rows, splits)),
+        threshold=threshold,
+        sample_cutoff=cutoff,
+        digests=dict(digests),
+        rule_digest=rule_digest,
     )
 
 
@@ -210,17 +214,18 @@ def _extended(
     new = [name for name in candidates if name not in same]
     rounds = previous.rounds + any(name not in previous.digests for name in new)
     known = {row.video_id: row.split for row in previous.rows if row.split}
-    # What a person says of a video holds whenever it is said; the hash's word is kept.
-    splits = video_splits(list(candidates), rule) if rule.split else {**_hashed_splits(new, rule), **known}
-    rows = [
-        replace(row, split=splits[row.video_id]) if row.kept else row for row in previous.rows if row.video_id in same
-    ]
+    rows = [row for row in previous.rows if row.video_id in same]
     old_round = {row.video_id: row.round for row in previous.rows}
     for name in new:
         for row in candidates[name]:
-            judged = _judged(row, previous.threshold, previous.sample_cutoff, rule.seed, splits)
+            judged = _judged(row, previous.threshold, previous.sample_cutoff, rule.seed)
             rows.append(replace(judged, round=old_round.get(name, rounds)))
-    return replace(previous, rows=_ordered(rows), rounds=rounds, digests=dict(digests))
+    # What a person says of a video holds whenever it is said; the hash's word is kept.
+    if rule.split or not known:
+        splits = video_splits(list(candidates), rule, kept={row.video_id for row in rows if row.kept})
+    else:
+        splits = {**_hashed_splits(new, rule), **known}
+    return replace(previous, rows=_ordered(_split(rows, splits)), rounds=rounds, digests=dict(digests))
 
 
 def object_threshold(objects: Sequence[float], keep_share: float) -> float | None:
@@ -231,15 +236,23 @@ def object_threshold(objects: Sequence[float], keep_share: float) -> float | Non
     return float(sorted(objects, reverse=True)[keep - 1])
 
 
-def video_splits(video_ids: Sequence[str], rule: SelectionRule) -> dict[str, str]:
-    """The split of each source video; train is never empty, and one source goes all to train.
+def video_splits(
+    video_ids: Sequence[str], rule: SelectionRule, *, kept: Collection[str] | None = None
+) -> dict[str, str]:
+    """The split of each source video; unless a person gives it, train is never empty, and one source goes all to train.
+
+    Args:
+        video_ids: all source videos.
+        rule: what decides.
+        kept: those with a clip that is kept, for the others fill no split; None takes all.
 
     Raises:
         ConfigError: the rule names splits, and not for every video.
     """
     splits = _hashed_splits(video_ids, rule)
-    if splits and rule.split is None and "train" not in splits.values():
-        splits[max(video_ids, key=lambda name: hashed_share(rule.seed, "split", name))] = "train"
+    filling = [name for name in video_ids if kept is None or name in kept]
+    if filling and rule.split is None and all(splits[name] != "train" for name in filling):
+        splits[max(filling, key=lambda name: hashed_share(rule.seed, "split", name))] = "train"
     return splits
 
 
@@ -254,9 +267,7 @@ def _hashed_splits(video_ids: Sequence[str], rule: SelectionRule) -> dict[str, s
     return {name: rule.split[name] for name in video_ids}
 
 
-def _judged(
-    row: ClipRow, threshold: float | None, cutoff: float | None, seed: int, splits: Mapping[str, str]
-) -> ClipRow:
+def _judged(row: ClipRow, threshold: float | None, cutoff: float | None, seed: int) -> ClipRow:
     if not row.kept:
         return row
     if not _enough(row, threshold):
@@ -264,7 +275,11 @@ def _judged(
     share = hashed_share(seed, "sample", row.key)
     if cutoff is not None and share > cutoff:
         return replace(row, kept=False, reason=f"sample={share:.6f} > cutoff={cutoff:.6f}")
-    return replace(row, split=splits[row.video_id])
+    return row
+
+
+def _split(rows: Sequence[ClipRow], splits: Mapping[str, str]) -> list[ClipRow]:
+    return [replace(row, split=splits[row.video_id]) if row.kept else row for row in rows]
 
 
 def _enough(row: ClipRow, threshold: float | None) -> bool:

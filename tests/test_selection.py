@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -65,6 +67,18 @@ def test_one_source_goes_all_to_train_and_a_split_keeps_sources_whole():
     by_video = {row.video_id: {r.split for r in selection.kept if r.video_id == row.video_id} for row in selection.kept}
     assert all(len(splits) == 1 for splits in by_video.values())
     assert {split for splits in by_video.values() for split in splits} == {"train", "val"}
+
+
+@pytest.mark.parametrize(
+    "beside", [[], [ClipRow(key="t_0", video_id="t", start=0, end=121, kept=False, reason="cut=1")]]
+)
+def test_a_video_without_a_kept_clip_does_not_fill_train(beside):
+    names = [f"v{n}" for n in range(40)]
+    by_hash = video_splits(names, SelectionRule())
+    val, train = (next(name for name in names if by_hash[name] == split) for split in ("val", "train"))
+    candidates = {val: rows(val, [5.0] * 4), train: [replace(row, video_id=train) for row in beside]}
+    for previous in (None, select({train: candidates[train]})):
+        assert {row.split for row in select(candidates, previous=previous).kept} == {"train"}
 
 
 def test_a_split_file_decides_and_must_name_every_video():
