@@ -31,6 +31,8 @@ its frames, and a day beside."""
 # Decoding and converting run beside encoding, as in ffmpeg itself.
 _FRAMES_AHEAD = 4
 _VIDEO_ID = re.compile(r"[A-Za-z0-9_-]+")
+LONGEST_VIDEO_ID = 75
+"""Names in a shard end at 100 bytes: the id, ``_``, seven digits of a start frame, and ``.cam_to_world.npy``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, order=True)
@@ -222,11 +224,17 @@ def check_video_id(video_id: str) -> str:
     """Return ``video_id`` if it can be part of a key.
 
     Raises:
-        ConfigError: characters other than letters, digits, ``_`` and ``-`` (WebDataset splits a name at its first dot).
+        ConfigError: more than ``LONGEST_VIDEO_ID`` characters, or others than letters, digits, ``_`` and ``-``
+            (WebDataset splits a name at its first dot).
     """
     if not _VIDEO_ID.fullmatch(video_id):
         raise ConfigError(
             f"video id {video_id!r} may hold only letters, digits, _ and -; rename the file or give an id"
+        )
+    if len(video_id) > LONGEST_VIDEO_ID:
+        raise ConfigError(
+            f"video id {video_id!r} has {len(video_id)} characters, and a shard's names have room for "
+            f"{LONGEST_VIDEO_ID}; rename the file or give an id"
         )
     return video_id
 

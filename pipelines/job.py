@@ -11,7 +11,7 @@ import yaml
 
 from dataset.receipts import Receipt, atomic_write, read_receipts
 from labeling.errors import ConfigError
-from labeling.timeline import check_video_id
+from labeling.timeline import LONGEST_VIDEO_ID, check_video_id
 from pipelines.config import Config, parse_config, read_yaml
 from pipelines.stage import WorkItem, item_state, load_stage
 
@@ -196,7 +196,7 @@ def check_id(video_id: str, path: Path) -> None:
         check_video_id(video_id)
     except Exception as error:
         raise ConfigError(
-            f"{path}: {video_id!r} is no video id (letters, digits, - and _ only); rename the file, or give a text "
+            f"{path}: {video_id!r} is no video id (at most {LONGEST_VIDEO_ID} letters, digits, - and _); rename the file, or give a text "
             "file of lines `id<TAB>path` in its place"
         ) from error
 

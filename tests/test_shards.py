@@ -15,7 +15,8 @@ from dataset.shards import (
     write_shard,
     write_shard_index,
 )
-from labeling.errors import DataError
+from labeling.errors import ConfigError, DataError
+from labeling.timeline import LONGEST_VIDEO_ID, clip_key
 
 
 def sizes(counts, *, split="train", round_=0):
@@ -74,6 +75,15 @@ def test_the_same_samples_give_the_same_bytes(tmp_path):
         (tmp_path / folder).mkdir()
         write(tmp_path / folder / "train-000000.tar")
     assert (tmp_path / "a/train-000000.tar").read_bytes() == (tmp_path / "b/train-000000.tar").read_bytes()
+
+
+def test_the_longest_video_id_fits_into_a_shard(tmp_path):
+    key = clip_key("v" * LONGEST_VIDEO_ID, 9_999_999)
+    plan = ShardPlan(name="train-000000.tar", split="train", keys=(key,))
+    (row,) = write_shard(tmp_path / plan.name, plan, [(key, {"cam_to_world.npy": lambda: b"numbers"})])
+    assert read_member(tmp_path, row) == b"numbers"
+    with pytest.raises(ConfigError, match="76 characters.*room for 75"):
+        clip_key("v" * (LONGEST_VIDEO_ID + 1), 0)
 
 
 def test_an_index_comes_back_and_is_found_from_the_job(tmp_path):
