@@ -7,6 +7,7 @@ be read alone by one seek.
 import hashlib
 import io
 import os
+import re
 import tarfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,12 +20,9 @@ from labeling.errors import DataError
 
 Split = Literal["train", "val"]
 
-MEMBER_SUFFIXES = (
-    "rgb.mp4", "skeleton.mp4", "ego.mp4", "objects.mp4", "labels.parquet", "cam_to_world.npy", "txt", "json",
-)  # fmt: skip
-"""What a sample holds, in this order; ``--videos rgb`` leaves the three views out."""
-
 _BLOCK = 512
+_KEY = re.compile(r"[A-Za-z0-9_-]+")
+_FILE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]*")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,9 +139,17 @@ def read_shard_index(path: Path) -> list[Member]:
     """The rows of ``index.parquet``, in order.
 
     Raises:
-        DataError: the file is missing or has other columns.
+        DataError: the file is missing, has other columns, or names that lead out of a folder.
     """
-    return [Member(**row) for row in read_table(path, SHARD_INDEX_SCHEMA)[0].to_pylist()]
+    rows = [Member(**row) for row in read_table(path, SHARD_INDEX_SCHEMA)[0].to_pylist()]
+    for row in rows:
+        # Shards come from others too: a shard is opened by its name, and an export calls files by their keys.
+        if not _KEY.fullmatch(row.key) or not _FILE_NAME.fullmatch(row.shard):
+            raise DataError(
+                f"{path}: names clip {row.key!r} in shard {row.shard!r}; keys hold only letters, digits, _ and -, and "
+                "shards lie beside their index: pack the job again, or take its shards from somebody you trust"
+            )
+    return rows
 
 
 def find_shards(job_or_shards: Path) -> Path:

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from dataset.shards import (
     ClipSize,
+    Member,
     ShardPlan,
     check_shard,
     find_shards,
@@ -94,6 +95,17 @@ def test_an_index_comes_back_and_is_found_from_the_job(tmp_path):
     assert find_shards(tmp_path) == find_shards(tmp_path / "shards") == tmp_path / "shards"
     with pytest.raises(DataError, match="animatic pack"):
         find_shards(tmp_path / "elsewhere")
+
+
+@pytest.mark.parametrize(
+    ("key", "shard"),
+    [("../../a_0", "t.tar"), ("a.b_0", "t.tar"), ("", "t.tar"), ("a_0", "../t.tar"), ("a_0", "/t.tar"), ("a_0", "..")],
+)
+def test_names_that_lead_out_of_the_folder_are_refused(tmp_path, key, shard):
+    row = Member(key=key, split="train", shard=shard, member="txt", offset=0, size=1, sha256="")
+    write_shard_index(tmp_path / "index.parquet", [row])
+    with pytest.raises(DataError, match="lie beside their index"):
+        read_shard_index(tmp_path / "index.parquet")
 
 
 def test_a_broken_shard_is_found_out(tmp_path):
