@@ -284,8 +284,10 @@ def read_tum(path: Path) -> Trajectory:
     """
     rows = _read_rows(path, columns=8)
     lengths = np.linalg.norm(rows[:, 4:], axis=1)
-    if (np.abs(lengths - 1) > 1e-2).any():
-        at = int(np.argmax(np.abs(lengths - 1)))
+    # Written so that a length that is no number is none either.
+    wrong = ~(np.abs(lengths - 1) <= 1e-2)
+    if wrong.any():
+        at = int(np.argmax(wrong))
         raise TrajectoryError(f"{path}: row {at} has a quaternion of length {lengths[at]:.3g}; give unit qx qy qz qw")
     check_times(rows[:, 0])
     return rebased_trajectory(rows[:, 0], rigid(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4]))
@@ -310,7 +312,7 @@ def read_kitti(path: Path, *, fps: float) -> Trajectory:
 
 def _read_rows(path: Path, *, columns: int) -> np.ndarray:
     try:
-        rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
+        rows = np.loadtxt(path, dtype=np.float64, ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise TrajectoryError(f"{path}: cannot be read as {columns} numbers a row ({error})") from error
     if rows.shape[1:] != (columns,) or len(rows) == 0:

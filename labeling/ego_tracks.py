@@ -4,6 +4,8 @@ Everything here is in pixels and knows no camera; ``labeling.ego_motion`` solves
 so that a run can be solved again with another focal length without looking at its pictures twice.
 """
 
+import zipfile
+import zlib
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,7 +74,7 @@ def load_tracks(path: Path) -> RunTracks:
             )
         )  # fmt: skip
         width, height, source_width, source_height = (int(value) for value in arrays["size"])
-    except (OSError, ValueError, KeyError, IndexError) as error:
+    except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"{path}: not a file of corner tracks ({error}); track the run again") from error
     return RunTracks(
         width=width, height=height, source_width=source_width, source_height=source_height,

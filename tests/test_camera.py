@@ -119,8 +119,9 @@ def test_tum_and_kitti_files_round_trip(tmp_path: Path) -> None:
         ("0 0 0 0 0 0 0 2\n", "quaternion"),
         ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "does not increase"),
         ("0 nan 0 0 0 0 0 1\n", "not finite"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 nan 0 0 1\n", "row 1 has a quaternion of length nan"),
     ],
-    ids=["empty", "too few columns", "text", "not a unit quaternion", "time backwards", "nan"],
+    ids=["empty", "too few columns", "text", "not a unit quaternion", "time backwards", "nan", "nan turn"],
 )
 @pytest.mark.filterwarnings("ignore:loadtxt")
 def test_bad_trajectory_files_say_what_is_wrong(tmp_path: Path, text: str, message: str) -> None:

@@ -93,6 +93,14 @@ def test_a_tum_file_that_cannot_be_is_refused(tmp_path, drive, harm, message):
     assert str(path) in str(error.value)
 
 
+def test_a_byte_order_mark_is_no_number(tmp_path, drive):
+    path = tum_of(drive, tmp_path)
+    np.savetxt(path, np.loadtxt(path))
+    before = read_drive(path, video_times_s=VIDEO_S)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert np.array_equal(read_drive(path, video_times_s=VIDEO_S).cam_to_world, before.cam_to_world)
+
+
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"a b c d e f g h\n", b"", b"1 2 3\n"], ids=str)
 def test_what_is_no_trajectory_is_refused(tmp_path, content):
     (tmp_path / "drive.tum").write_bytes(content)

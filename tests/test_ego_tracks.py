@@ -94,6 +94,17 @@ def test_a_file_that_is_not_tracks_is_refused(tmp_path):
         load_tracks(tmp_path / "run.npz")
 
 
+@pytest.mark.parametrize("harm", ["cut off", "empty", "flipped"])
+def test_a_broken_file_of_tracks_is_refused(tmp_path, harm):
+    path = tmp_path / "run.npz"
+    track_run(panned(3), np.arange(3) / 24, settings=SETTINGS).save(path)
+    whole = path.read_bytes()
+    flipped = whole[:600] + bytes(byte ^ 255 for byte in whole[600:4000]) + whole[4000:]
+    path.write_bytes({"cut off": whole[: len(whole) // 2], "empty": b"", "flipped": flipped}[harm])
+    with pytest.raises(DataError, match="track the run again"):
+        load_tracks(path)
+
+
 def test_a_dark_picture_still_has_corners():
     dark = [(picture // 12 + 2).astype(np.uint8) for picture in panned(3)]
     tracks = track_run(dark, np.arange(3) / 24, settings=SETTINGS)
