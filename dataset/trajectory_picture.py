@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
 from dataset.inspection import clip_verdict
+from dataset.receipts import outputs_present, read_receipts
+from dataset.selection import read_selection
 from dataset.tables import EgoTable, read_ego
 from labeling.camera import rebased_trajectory
 from labeling.errors import DataError
@@ -32,15 +34,26 @@ def clip_motion(job: Path, key: str) -> EgoTable:
     """The stored camera motion of a clip, re-based to its first frame, seconds from there.
 
     Raises:
-        DataError: no such clip, or none of its runs has a trajectory yet.
+        DataError: no such clip, or no receipt says that one of its runs has a trajectory.
     """
     row = clip_verdict(job, key)
-    for path in sorted((job / "videos" / row.video_id).glob("run_*.ego.parquet")):
-        match = re.fullmatch(r"run_(\d+)_(\d+)\.ego\.parquet", path.name)
-        if match and int(match[1]) <= row.start and row.end <= int(match[2]):
-            return sliced(read_ego(path), row.start - int(match[1]), row.end - int(match[1]))
+    # Runs of an earlier selection keep their receipts: those that begin and end with clips kept now come first.
+    kept = [other for other in read_selection(job / "selection.parquet").kept if other.video_id == row.video_id]
+    starts, ends = {other.start for other in kept}, {other.end for other in kept}
+    runs = sorted(_told_runs(job, row.video_id), key=lambda run: (run[0] in starts) + (run[1] in ends), reverse=True)
+    for start, end, path in runs:
+        if start <= row.start and row.end <= end:
+            return sliced(read_ego(path), row.start - start, row.end - start)
     why = row.reason or f"run `animatic ego {job}`"
     raise DataError(f"{job}: has no trajectory of {key} ({why})")
+
+
+def _told_runs(job: Path, video_id: str) -> Iterator[tuple[int, int, Path]]:
+    """Start, end and file of a video's runs whose trajectories are done: what a receipt says, not what lies there."""
+    for receipt in read_receipts(job, "ego").values():
+        match = re.fullmatch(re.escape(video_id) + r"/run_(\d+)_(\d+)", receipt.item)
+        if match and receipt.state == "done" and outputs_present(job, receipt):
+            yield int(match[1]), int(match[2]), job / receipt.output(".ego.parquet").path
 
 
 def sliced(ego: EgoTable, start: int, end: int) -> EgoTable:

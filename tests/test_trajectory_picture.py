@@ -9,6 +9,7 @@ import pytest
 from ego_fixtures import driven
 from matplotlib.figure import Figure
 
+from dataset.receipts import Output, Receipt, ReceiptLog
 from dataset.selection import ClipRow, Selection, write_selection
 from dataset.tables import EgoTable, read_ego, write_ego
 from dataset.trajectory_picture import (
@@ -25,7 +26,9 @@ from labeling.ego_motion import EgoMotion, RoadView
 from labeling.errors import DataError
 
 
-def stored(path: Path, poses: np.ndarray, *, modes: str = "moving", confidence: float = 1.0) -> EgoTable:
+def stored(
+    path: Path, poses: np.ndarray, *, modes: str = "moving", confidence: float = 1.0, first_frame: int = 48
+) -> EgoTable:
     count = len(poses)
     motion = EgoMotion(
         trajectory=Trajectory(timestamps_s=10 + np.arange(count) / 24, cam_to_world=poses),
@@ -33,16 +36,25 @@ def stored(path: Path, poses: np.ndarray, *, modes: str = "moving", confidence: 
         scale_source=np.full(count, "road"), scale_sigma=np.full(count, 0.1, np.float32),
         intrinsics=prior_intrinsics(96, 64), road=RoadView(height_m=1.5, pitch_rad=0.02, pitch_sigma_rad=np.inf),
     )  # fmt: skip
-    write_ego(path, motion, first_frame=48)
+    write_ego(path, motion, first_frame=first_frame)
     return read_ego(path)
+
+
+def told(root: Path, start: int, end: int, *, speed: float) -> None:
+    """A run of video v with its receipt."""
+    path = f"videos/v/run_{start}_{end}.ego.parquet"
+    (root / path).parent.mkdir(parents=True, exist_ok=True)
+    stored(root / path, driven(np.full(end - start, speed), 20.0), first_frame=start)
+    outputs = (Output(path=path, size=(root / path).stat().st_size, sha256="0"),)
+    receipt = Receipt(stage="ego", item=f"v/run_{start}_{end}", state="done", key="k", outputs=outputs)
+    ReceiptLog(root, "ego", worker="w").append(receipt)
 
 
 @pytest.fixture(scope="module")
 def job(tmp_path_factory):
     """A labelled run [48, 96) that holds one clip, another clip without a run, and a dropped one."""
     root = tmp_path_factory.mktemp("job")
-    (root / "videos" / "v").mkdir(parents=True)
-    stored(root / "videos" / "v" / "run_48_96.ego.parquet", driven(np.full(48, 6.0), 20.0))
+    told(root, 48, 96, speed=6.0)
     rows = [ClipRow(key=f"v_{start}", video_id="v", start=start, end=start + 24) for start in (56, 200)]
     rows.append(ClipRow(key="v_300", video_id="v", start=300, end=324, kept=False, reason="objects=1 < threshold=3"))
     selection = Selection(rows=tuple(rows), threshold=None, sample_cutoff=None, digests={}, rule_digest="r")
@@ -57,6 +69,19 @@ def test_a_clip_s_motion_is_its_run_s_from_its_own_start(job):
     assert ego.trajectory.timestamps_s[0] == 0 and np.array_equal(ego.trajectory.cam_to_world[0], np.eye(4))
     assert speeds_m_s(ego) == pytest.approx(np.full(24, 6.0), rel=1e-6)
     assert yaw_rates_deg_s(ego) == pytest.approx(np.full(24, 20.0), rel=1e-6)
+
+
+def test_of_two_runs_the_one_that_the_job_speaks_of_is_shown(tmp_path):
+    rows = [ClipRow(key=f"v_{start}", video_id="v", start=start, end=start + 24) for start in (48, 72)]
+    selection = Selection(rows=tuple(rows), threshold=None, sample_cutoff=None, digests={}, rule_digest="r")
+    write_selection(tmp_path / "selection.parquet", selection)
+    (tmp_path / "videos" / "v").mkdir(parents=True)
+    stored(tmp_path / "videos" / "v" / "run_0_96.ego.parquet", driven(np.full(96, 1.0)), first_frame=0)
+    with pytest.raises(DataError, match="animatic ego"):
+        clip_motion(tmp_path, "v_72")
+    told(tmp_path, 24, 120, speed=3.0)  # Of an earlier selection.
+    told(tmp_path, 48, 96, speed=6.0)
+    assert speeds_m_s(clip_motion(tmp_path, "v_72")) == pytest.approx(np.full(24, 6.0), rel=1e-6)
 
 
 @pytest.mark.parametrize("speed", [-3.0, 0.0, 8.0], ids=str)
