@@ -150,7 +150,9 @@ class Street:
         )  # fmt: skip
         classes = np.zeros((0, 0), np.uint8)
         if segments:
-            classes = segment_canvas(canvas, actors, cam_to_street=cam_to_street, intrinsics=self.intrinsics)
+            classes = segment_canvas(
+                canvas, actors, path=self.drive.path, cam_to_street=cam_to_street, intrinsics=self.intrinsics
+            )
         rgb = self._rolling_rgb(i) if self.config.rolling_shutter_s else canvas.rgb
         return StreetFrame(index=i, rgb=rgb, objects=(*objects, *lanes), segments=classes)
 

@@ -8,7 +8,7 @@ import pytest
 
 from dataset.street import Street, StreetConfig
 from dataset.street_segments import SEGMENTS
-from labeling.camera import rigid
+from labeling.camera import Trajectory, rigid
 from labeling.errors import ConfigError, DataError
 from training.metrics import mean_interval
 from training.study_judge import PAIR_FRAMES, JudgeClip, chained, motion_of, pair_batch
@@ -180,6 +180,18 @@ def test_segments_agree_with_the_boxes_and_the_horizon():
     assert not (car & ~inside).any()
     assert not (frame.segments[:40] == SEGMENTS.index("ground")).any()
     assert (frame.segments[-4:] == SEGMENTS.index("ground")).mean() > 0.5
+
+
+@pytest.mark.parametrize("hill_m", [2.0, -2.0], ids=str)
+def test_the_road_over_a_hill_is_ground(hill_m):
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, 2, 3] = np.arange(60)
+    poses[:, 1, 3] = -hill_m * np.sin(np.pi * np.arange(60) / 59)
+    way = Trajectory(timestamps_s=np.arange(60) / 24, cam_to_world=poses)
+    config = StreetConfig(seed=3, width=96, height=64, frames=60, scenario="empty", trajectory=way)
+    shown = Street(config).render(30, segments=True).segments
+    assert (shown[50:, 40:56] == SEGMENTS.index("ground")).all()
+    assert (shown == SEGMENTS.index("thing")).any()
 
 
 def test_a_smoke_run_goes_through_and_goes_on_where_it_was(tmp_path: Path):
