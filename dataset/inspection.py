@@ -88,7 +88,9 @@ def summarize(job: Path) -> Summary:
     if not (job / "selection.parquet").is_file():
         raise DataError(f"{job}: holds no selection; make one with `animatic label VIDEO... --out {job}`")
     selection = read_selection(job / "selection.parquet")
-    receipts = {stage: read_receipts(job, stage) for stage in ("index", "count", "cut", "keypoints", "ego", "render")}
+    # By the stages that there are receipts of: which there may be is for the pipeline to know.
+    logged = {folder.name for folder in (job / "receipts").glob("*") if folder.is_dir()}
+    receipts = {stage: read_receipts(job, stage) for stage in sorted(logged | {"index", "render"})}
     index_file = job / "shards" / "index.parquet"
     rows = read_shard_index(index_file) if index_file.is_file() else []
     lengths = {row.key: row.end - row.start for row in selection.rows}

@@ -248,11 +248,11 @@ class EgoTable:
     trajectory: Trajectory
     """In the run's first camera; seconds from the video's first frame."""
     mode: list[str]
-    """T times still, turning, moving, held or cut."""
+    """T times still, turning, moving, held, cut or missing (an imported trajectory says nothing of the frame)."""
     confidence: np.ndarray
     """(T,) float32, 0 to 1."""
     scale_source: list[str]
-    """T times road, held or default: what metres rest on."""
+    """T times road, held, default or given (imported): what metres rest on."""
     scale_sigma: np.ndarray
     """(T,) float32: one sigma of the scale, relative to it."""
     intrinsics: Intrinsics

@@ -106,7 +106,8 @@ def calibrate_camera(
         DataError: no runs, or runs of different pictures.
     """
     settings, mounting = settings or EgoSettings(), mounting or KnownMounting()
-    if not runs or any((run.width, run.height) != (runs[0].width, runs[0].height) for run in runs):
+    # Once over the runs in order: each may be read from its file.
+    if len({(run.width, run.height) for run in runs}) != 1:
         raise DataError(
             "a camera is calibrated from one or more runs of one picture size; track the video's runs again"
         )

@@ -45,8 +45,6 @@ class FrameTracks:
     """The scene changes at this frame: no corner is older than it."""
     repeated: bool
     """The picture is the previous one again."""
-    grey_level: float
-    """Mean grey, 0 to 255."""
 
 
 class CornerTracker:
@@ -73,11 +71,10 @@ class CornerTracker:
         """Follow the corners into the next picture and find new ones where there are few."""
         grey = self._grey(picture)
         thumbnail = cv2.resize(grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
-        level = float(thumbnail.mean())
         repeated = (
             not restart and self._previous is not None and (repeated or _same_picture(thumbnail, self._thumbnail))
         )
-        dark = level < self._settings.dark_level
+        dark = bool(thumbnail.mean() < self._settings.dark_level)
         seen = _equalised(grey) if dark else grey
         allowed = self._allowed(boxes_xyxy)
         back = np.zeros(len(self._ids), np.float32)
@@ -99,7 +96,7 @@ class CornerTracker:
         return FrameTracks(
             ids=self._ids.copy(), points_px=self._points.copy(),
             forward_backward_px=np.concatenate([back, np.zeros(added, np.float32)]),
-            cut=cut, repeated=repeated, grey_level=level,
+            cut=cut, repeated=repeated,
         )  # fmt: skip
 
     def _scene_changes(self, thumbnail: np.ndarray) -> bool:

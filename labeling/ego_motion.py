@@ -53,11 +53,11 @@ class EgoMotion:
     """In the run's first camera, metres."""
     mode: np.ndarray
     """(T,) str: still | turning | moving | held | cut: how frame i was reached from i - 1; frame 0 repeats frame
-    1's."""
+    1's. Or missing: an imported trajectory says nothing of it."""
     confidence: np.ndarray
     """(T,) float32, 0 to 1."""
     scale_source: np.ndarray
-    """(T,) str: road | held | default."""
+    """(T,) str: road | held | default, or given: imported."""
     scale_sigma: np.ndarray
     """(T,) float32: one sigma of the metric scale, relative."""
     intrinsics: Intrinsics

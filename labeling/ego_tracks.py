@@ -48,7 +48,6 @@ class RunTracks:
             points_px=_joined([frame.points_px for frame in self.frames], np.zeros((0, 2), np.float32)),
             forward_backward_px=_joined([frame.forward_backward_px for frame in self.frames], np.zeros(0, np.float32)),
             flags=np.array([(frame.cut, frame.repeated) for frame in self.frames], dtype=bool).reshape(-1, 2),
-            grey_level=np.array([frame.grey_level for frame in self.frames]),
         )
 
 
@@ -65,12 +64,10 @@ def load_tracks(path: Path) -> RunTracks:
         parts = {name: np.split(arrays[name], ends[:-1]) for name in ("ids", "points_px", "forward_backward_px")}
         frames = tuple(
             FrameTracks(
-                ids=ids, points_px=points, forward_backward_px=back, cut=bool(cut), repeated=bool(repeated),
-                grey_level=float(level),
+                ids=ids, points_px=points, forward_backward_px=back, cut=bool(cut), repeated=bool(repeated)
             )
-            for ids, points, back, (cut, repeated), level in zip(
-                parts["ids"], parts["points_px"], parts["forward_backward_px"], arrays["flags"], arrays["grey_level"],
-                strict=True,
+            for ids, points, back, (cut, repeated) in zip(
+                parts["ids"], parts["points_px"], parts["forward_backward_px"], arrays["flags"], strict=True
             )
         )  # fmt: skip
         width, height, source_width, source_height = (int(value) for value in arrays["size"])

@@ -79,7 +79,6 @@ def tracks_of(
             FrameTracks(
                 ids=ids[order], points_px=noisy.astype(np.float32),
                 forward_backward_px=np.full(len(ids), noise_px, np.float32), cut=False, repeated=False,
-                grey_level=120.0,
             )
         )  # fmt: skip
     return RunTracks(

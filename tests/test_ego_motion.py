@@ -217,7 +217,6 @@ def test_what_disappears_is_held():
     blind = [
         frame.__class__(
             ids=np.zeros(0, np.int64), points_px=empty, forward_backward_px=empty[:, 0], cut=False, repeated=False,
-            grey_level=0.0,
         )
         for frame in source.frames[30:36]
     ]  # fmt: skip

@@ -27,6 +27,7 @@ def job(tmp_path_factory):
     selection = Selection(rows=tuple(rows), threshold=3.0, sample_cutoff=None, digests={"v": "d"}, rule_digest="r")
     write_selection(root / "selection.parquet", selection)
     receipt(root, "index", "v", facts={"seconds": 7200.0})
+    receipt(root, "corners", "v/run_0_9", state="failed", reason="storage", message="no space")
     receipt(root, "index", "w", state="failed", reason="video", message="w.mp4: is no video")
     receipt(root, "render", "v_0", facts={"objects": 2, "metres": 40.0})
     receipt(root, "render", "v_8", state="dropped", reason="cut=1 first at 0.500 s")
@@ -64,7 +65,7 @@ def test_a_summary_counts_what_there_is(job):
     assert (summary.videos, summary.source_hours) == (1, 2.0)
     assert (summary.clips, summary.kept, summary.packed) == (3, 2, {"train": 1, "val": 0})
     assert summary.dropped == {"cut": 1, "objects": 1}
-    assert summary.failed == {"index": 1}
+    assert summary.failed == {"corners": 1, "index": 1}
     assert summary.objects_per_clip and summary.tracks_per_clip and summary.path_length_m
     assert summary.objects_per_clip.greatest == 4.0 and summary.threshold == 3.0
     assert summary.tracks_per_clip.total == 2 and summary.path_length_m.median == 40.0
