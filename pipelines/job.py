@@ -196,8 +196,8 @@ def check_id(video_id: str, path: Path) -> None:
         check_video_id(video_id)
     except Exception as error:
         raise ConfigError(
-            f"{path}: {video_id!r} is no video id (at most {LONGEST_VIDEO_ID} letters, digits, - and _); rename the file, or give a text "
-            "file of lines `id<TAB>path` in its place"
+            f"{path}: {video_id!r} is no video id (at most {LONGEST_VIDEO_ID} letters, digits, - and _); rename the "
+            "file, or give a text file of lines `id<TAB>path` in its place"
         ) from error
 
 
