@@ -53,7 +53,7 @@ class CornersStage:
                 continue
             items.append(
                 WorkItem(
-                    stage=self.name, name=name, owner=video_id, version=1, settings=settings,
+                    stage=self.name, name=name, owner=video_id, version=2, settings=settings,
                     inputs=_hashes(*cut[name].outputs, *receipt.outputs),
                     outputs=(run_path(video_id, run, ".corners.npz"),), weight=float(len(run)),
                 )
@@ -95,7 +95,7 @@ class CameraStage:
             files = [output for run in runs for output in receipts[run].outputs]
             items.append(
                 WorkItem(
-                    stage=self.name, name=video_id, owner=video_id, version=1, settings=settings,
+                    stage=self.name, name=video_id, owner=video_id, version=2, settings=settings,
                     inputs=_hashes(index[video_id].output("index.parquet"), *files),
                     outputs=(camera_path(video_id),), payload={"corners": [output.path for output in files]},
                     weight=1.0 + sum(receipts[run].facts["frames"] for run in runs),
@@ -151,7 +151,7 @@ class EgoStage:
             imported = asdict(given) if given is not None else None
             items.append(
                 WorkItem(
-                    stage=self.name, name=name, owner=video_id, version=2, settings={} if imported else settings,
+                    stage=self.name, name=name, owner=video_id, version=3, settings={} if imported else settings,
                     inputs={**_hashes(*files, *camera[video_id].outputs), "imported": imported},
                     outputs=(run_path(video_id, run, ".ego.parquet"),), weight=float(len(run)),
                 )
