@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from dataset.street_actors import Actor
 from dataset.street_drives import StreetPath
@@ -45,4 +45,4 @@ def _ground_m(path: StreetPath, places_xz: np.ndarray) -> np.ndarray:
     """Height of the ground at (..., 2) places: the path's, where it comes nearest."""
     if np.ptp(path.elevation) < 1e-6:
         return np.full(places_xz.shape[:-1], path.elevation[0])
-    return path.elevation[cKDTree(path.points_xz).query(places_xz)[1]]
+    return path.elevation[KDTree(path.points_xz).query(places_xz)[1]]
