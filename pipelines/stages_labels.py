@@ -18,7 +18,7 @@ from pipelines.config import KeypointSettings
 from pipelines.job import Job
 from pipelines.layout import parse_run_item, run_path
 from pipelines.stage import WorkItem
-from pipelines.stages_select import job_extractors, weights_hashes
+from pipelines.stages_select import job_extractors, model_hashes
 
 
 class KeypointsStage:
@@ -32,7 +32,7 @@ class KeypointsStage:
     def plan(self, job: Job) -> list[WorkItem]:
         """One item per run that is cut."""
         cards = [card.name for card in job_extractors(job).cards]
-        models = weights_hashes(job, cards)
+        models = model_hashes(job, cards)
         settings = {"keypoints": job.config.keypoints.model_dump(mode="json"), "cards": cards}
         items = []
         for name, receipt in job.done("cut").items():

@@ -36,17 +36,22 @@ NO_DETECTOR = (
     "one, `--models DIR` where it lies, and `--keep-share 1` keeps every clip without one"
 )
 
+_TOLD_ONLY = {"licence", "source", "notes", "accuracy"}
+"""Of a card: what no label depends on."""
+
 
 def job_extractors(job: Job) -> ExtractorChoice:
     """The model cards that a job uses."""
     return choose_extractors(job.config.keypoints.extractors, models_dir=job.models_dir)
 
 
-def weights_hashes(job: Job, names: list[str]) -> dict[str, str]:
-    """sha256 of each card's weights as they lie there, by card name."""
+def model_hashes(job: Job, names: list[str]) -> dict[str, str]:
+    """What each card's network is, by card name: sha256 of its weights as they lie there, then a digest of how its card
+    says that they are used."""
     cards = load_cards(job.models_dir)
-    found = {name: find_weights(cards[name], job.models_dir) for name in names}
-    return {name: weights_sha256(path) for name, path in sorted(found.items()) if path is not None}
+    found = {name: find_weights(cards[name], job.models_dir) for name in sorted(names)}
+    used = {name: digest(cards[name].model_dump(mode="json", exclude=_TOLD_ONLY)) for name in found}
+    return {name: f"{weights_sha256(path)} {used[name]}" for name, path in found.items() if path is not None}
 
 
 class CountStage:
@@ -68,7 +73,7 @@ class CountStage:
         detector = job.config.count.detector or getattr(job_extractors(job).detector, "name", None)
         if detector is None:
             raise ConfigError(NO_DETECTOR)
-        models = weights_hashes(job, [detector])
+        models = model_hashes(job, [detector])
         settings = {
             "count": job.config.count.model_dump(mode="json"), "detector": detector,
             "picture": job.config.picture.model_dump(mode="json"),

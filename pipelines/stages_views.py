@@ -158,6 +158,9 @@ def _labelled_runs(job: Job) -> dict[str, list[tuple[Span, tuple[Output, ...]]]]
     cut, keypoints = job.done("cut"), job.done("keypoints")
     runs: dict[str, list[tuple[Span, tuple[Output, ...]]]] = {}
     for name, receipt in job.done("ego").items():
+        # An imported trajectory needs no labels, so its run may have none, yet or for good.
+        if name not in cut or name not in keypoints:
+            continue
         video_id, run = parse_run_item(name)
         files = (cut[name].output(".frames.parquet"), *keypoints[name].outputs, *receipt.outputs)
         runs.setdefault(video_id, []).append((run, files))

@@ -18,6 +18,8 @@ from labeling.errors import ConfigError, TrajectoryError
 from pipelines.cli import main
 from pipelines.imports import import_trajectories, match_files
 from pipelines.job import Job, Source, open_job, open_or_create
+from pipelines.stage import STAGES
+from pipelines.status import job_status
 
 KEEP_ALL = {"select": {"keep_share": 1.0}}
 VIDEO_S = np.arange(48) / 24
@@ -191,6 +193,18 @@ def test_an_import_changes_its_video_alone_and_lasts(tmp_path, drive, sources):
     for name in read_receipts(job.root, "ego"):
         path = f"videos/{name}.ego.parquet"
         assert (job.root / path).read_bytes() == (fresh.root / path).read_bytes()
+
+
+def test_an_imported_drive_without_labels_waits_for_them(tmp_path, drive, sources):
+    """The trajectory needs none, the clips do: nothing is rendered, and nothing fails."""
+    job = Job(tmp_path / "J", small_config(**KEEP_ALL), {"mine": sources["mine"]})
+    import_trajectories(job, tum_of(drive, tmp_path))
+    _, reports = run_all(job, stages=tuple(stage for stage in STAGES if stage not in ("keypoints", "pack", "shards")))
+    assert job.done("ego") and not job.done("render")
+    assert not [receipt.message for report in reports for receipt in report.failed]
+    assert job_status(job.root).stages
+    run_all(job)
+    assert set(ShardDataset(job.root, "train").keys) == {"mine_0", "mine_8", "mine_16", "mine_24", "mine_32"}
 
 
 def test_clips_that_the_file_does_not_cover_are_dropped_with_their_reason(tmp_path, drive, sources):

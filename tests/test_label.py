@@ -12,8 +12,10 @@ from dataset.inspection import contact_sheet, summarize
 from dataset.loader import ShardDataset
 from dataset.receipts import read_receipts
 from dataset.selection import read_selection
+from dataset.tables import read_keypoints
 from labeling.camera import check_poses
 from labeling.errors import ConfigError
+from labeling.model_cards import load_cards, write_card
 from labeling.timeline import clip_key
 from pipelines.job import Job, Source, find_videos, open_job, open_or_create
 from pipelines.label import sweep_outdated
@@ -145,6 +147,24 @@ def test_a_changed_setting_redoes_only_what_depends_on_it(tmp_path, short_video,
     views = ("skeleton.mp4", "ego.mp4", "objects.mp4")
     left = {name: data for name, data in tree(tmp_path / "J").items() if "shards/" in name or not name.endswith(views)}
     assert left == {name: data for name, data in tree(fresh.root).items() if name in left}
+
+
+def test_a_changed_card_is_another_model(tmp_path, short_video):
+    """Its thresholds make labels as its weights do; its notes do not."""
+    models = write_detector(tmp_path / "models")
+    sources = {"short": short_video}
+
+    def made_with(**changes):
+        card = load_cards(models)["counter"]
+        write_card(card.model_copy(update=changes), models / "counter.toml")
+        made, _ = run_all(Job(tmp_path / "J", small_config(), sources, models_dir=models))
+        return {stage for stage, _ in made}
+
+    assert {"count", "keypoints"} <= made_with()
+    assert made_with(notes="measured anew") == set()
+    assert {"count", "keypoints"} <= made_with(max_detections=1)
+    labels = (tmp_path / "J" / "videos" / "short").glob("*.keypoints.parquet")
+    assert all(len({label.track_id for label in read_keypoints(path)}) <= 1 for path in labels)
 
 
 def test_a_video_added_to_a_finished_job_redoes_nothing_else(tmp_path, videos, detector):
