@@ -141,9 +141,10 @@ def test_intervals_cover_the_truth() -> None:
 
 
 def test_pck_by_hand() -> None:
-    truth = np.array([[0, 0, 1], [10, 0, 1], [20, 0, 0]], float)
-    predicted = np.array([[3, 4, 1], [10, 6, 1], [20, 0, 1]], float)
-    assert pck(predicted, truth, np.array([0, 0, 30, 40])) == (1, 2)
+    """One within 5 px; one just outside; one that the truth does not show; one in its place that is not claimed."""
+    truth = np.array([[0, 0, 1], [10, 0, 1], [20, 0, 0], [30, 0, 1]], float)
+    predicted = np.array([[3, 4, 1], [10, 6, 1], [20, 0, 1], [30, 0, 0]], float)
+    assert pck(predicted, truth, np.array([0, 0, 30, 40])) == (1, 3)
 
 
 def test_pictures() -> None:
