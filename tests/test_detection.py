@@ -101,6 +101,16 @@ def test_a_class_may_have_a_threshold_of_its_own() -> None:
         toy_card(score_thresholds={"horse": 0.4})
 
 
+@pytest.mark.parametrize(
+    ("told", "car", "person"),
+    [({}, 0.5, 0.5), ({"car": 0.7}, 0.5, 0.5), ({"car": 0.7, "truck": 0.6}, 0.6, 0.5), ({"person": 0.8}, 0.5, 0.8),
+     ({"truck": 0.4}, 0.4, 0.5)],
+    ids=str,
+)  # fmt: skip
+def test_a_category_is_as_sure_as_its_most_trusted_class(told: dict[str, float], car: float, person: float) -> None:
+    assert toy_card(sure_scores=told).category_sure_scores == {"car": car, "person": person}
+
+
 def test_an_empty_frame_has_no_detections() -> None:
     found = detect([])
     assert len(found) == 0 and found.boxes_xyxy.shape == (0, 4)
