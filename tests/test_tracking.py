@@ -138,6 +138,17 @@ def test_known_camera_turn_saves_the_match() -> None:
         assert bool(before == after) is same
 
 
+@pytest.mark.parametrize("turn_px", [-10, 10])
+def test_who_is_hidden_while_the_camera_turns_goes_on_as_before(turn_px: int) -> None:
+    """A walker of 4 px a frame is hidden for half a second of a steady turn: the turn is not part of its own motion."""
+    tracker, shift = BoxTracker(), np.array([[1.0, 0, turn_px], [0, 1, 0], [0, 0, 1]])
+    ids: list[int] = []
+    for t in range(36):
+        boxes = np.empty((0, 4)) if 20 <= t < 32 else box(500 + (4 + turn_px) * t)[None]
+        ids += tracker.update(boxes, np.full(len(boxes), 0.9), previous_to_current=shift).tolist()
+    assert len(ids) == 24 and set(ids) == {0}
+
+
 def car(frame: int, x: float) -> Keypoints:
     return Keypoints(
         frame=frame, category="car", schema="car24", score=0.9, box_xyxy=box(x).astype(np.float32),
