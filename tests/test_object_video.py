@@ -1,5 +1,6 @@
 """Object video: which tracks are shown, where, in which colours."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -95,6 +96,16 @@ def test_near_boxes_cover_far_ones():
         picture = _frames(labels)[0]
         x, y = (far.box_xyxy[:2] + far.box_xyxy[2:]) / 2 * 768 / 1056
         assert tuple(picture[int(y), int(x)].tolist()) == colours[1]
+
+
+def test_the_nearer_is_the_one_that_stands_lower_however_tall_it_is():
+    """A tall thing in front begins above what it hides: feet tell the distance, heads do not."""
+    near = replace(car(frame=48, track_id=1), box_xyxy=np.array([100, 100, 300, 600], np.float32))
+    far = replace(car(frame=48, track_id=2), box_xyxy=np.array([150, 200, 400, 400], np.float32))
+    colours = dict(zip(chosen_tracks([near, far], key="a_48"), BOX_COLOURS, strict=False))
+    for labels in ([near, far], [far, near]):
+        picture = _frames(labels, width=1056, height=704)[0]
+        assert tuple(picture[300, 200].tolist()) == colours[1] and tuple(picture[300, 350].tolist()) == colours[2]
 
 
 def test_boxes_over_the_edge_are_cut_and_boxes_outside_vanish():
