@@ -82,6 +82,15 @@ def test_the_cameras_motion_in_words(drive, words):
     assert camera_motion(_drive(**drive)) == words
 
 
+@pytest.mark.parametrize(
+    ("frames", "yaw_deg", "turns"), [(25, 4, False), (25, 6, True), (121, 14, False), (121, 16, True)]
+)
+def test_a_turn_is_5_degrees_and_3_degrees_a_second(frames, yaw_deg, turns):
+    for sign, side in ((1, "right"), (-1, "left")):
+        words = camera_motion(_drive(speed=8, yaw_deg=sign * yaw_deg, frames=frames))
+        assert words == "drives forward at 8 m/s" + (f", turning {side}" if turns else "")
+
+
 def test_without_a_trajectory_the_caption_is_silent_about_the_camera():
     assert template_caption(_clip(cars=2)) == "A road with 2 cars ahead."
     assert template_caption([]) == "An empty road."
