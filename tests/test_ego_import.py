@@ -63,6 +63,8 @@ def test_a_kitti_file_has_a_row_for_each_frame_or_a_rate(tmp_path, drive):
         read_drive(path, video_times_s=VIDEO_S[:-1])
     at_12 = read_drive(path, video_times_s=VIDEO_S, clock=FileClock(fps=12))
     assert at_12.timestamps_s[-1] == pytest.approx(47 / 12)
+    later = read_drive(path, video_times_s=VIDEO_S, clock=FileClock(fps=12, offset_s=0.5))
+    assert later.timestamps_s == pytest.approx(np.arange(48) / 12 - 0.5)
     with pytest.raises(TrajectoryError, match="carries no times"):
         read_drive(path, video_times_s=None)
 
