@@ -153,6 +153,12 @@ def test_runs_cover_every_clip_once_and_nothing_else(starts: list[int]) -> None:
     assert all(a.end - b.start <= 73 for a, b in zip(runs, runs[1:], strict=False))
 
 
+def test_clips_that_touch_are_one_run_and_a_frame_between_makes_two() -> None:
+    first = Span(start=0, end=121)
+    assert plan_runs([first, Span(start=121, end=242)]) == [Span(start=0, end=242)]
+    assert plan_runs([first, Span(start=122, end=243)]) == [first, Span(start=122, end=243)]
+
+
 def test_names() -> None:
     assert clip_key("nOP1blfMCTg", 25392) == "nOP1blfMCTg_25392"
     assert run_name(Span(start=48, end=1440)) == "run_48_1440"
