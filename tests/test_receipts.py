@@ -40,6 +40,15 @@ def test_the_highest_turn_holds_whatever_log_it_is_in(tmp_path):
     assert read_receipts(tmp_path, "cut")["a"].state == "done"
 
 
+@pytest.mark.parametrize("other", ["failed", "dropped"])
+@pytest.mark.parametrize("workers", [("a", "z"), ("z", "a")], ids=str)
+def test_of_two_of_one_turn_the_one_that_is_done_holds(tmp_path, workers, other):
+    """Two workers that both took an item: what one of them made is there, whichever log is read last."""
+    ReceiptLog(tmp_path, "cut", worker=workers[0]).append(receipt(turn=2))
+    ReceiptLog(tmp_path, "cut", worker=workers[1]).append(receipt(turn=2, state=other, reason="video"))
+    assert read_receipts(tmp_path, "cut")["a"].state == "done"
+
+
 @pytest.mark.parametrize("kept", [1, 20, 60])
 def test_a_torn_last_line_is_ignored(tmp_path, kept):
     log = ReceiptLog(tmp_path, "cut", worker="w")
