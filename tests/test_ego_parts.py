@@ -1,5 +1,7 @@
 """The parts of ego-motion one by one: modes, speeds, smoothing, the road, calibration."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ego_fixtures import HEIGHT, WIDTH, driven, tracks_of
@@ -101,6 +103,14 @@ def test_ratios_carry_the_scale_where_no_road_is_seen():
     assert np.allclose(found.metres_per_s, speeds, rtol=0.08)
     assert set(found.source[:12]) == {"road"} and set(found.source[12:]) == {"held"}
     assert found.sigma[55] > found.sigma[5]
+
+
+def test_a_wrong_depth_counts_once_and_not_in_every_step():
+    """Sixty steps share one guess of the scene's depth, here twice too large: four steps of road outweigh it."""
+    speeds = np.full(60, 6.0)
+    told = replace(evidence_of(speeds, seen=np.arange(60) < 4), depth_per_s=2 * speeds / 1.5 / 8)
+    found = run_speeds(told, np.ones(60, bool), height_m=1.5, scale_walk=0.04, default_depth_heights=8)
+    assert np.allclose(found.metres_per_s, speeds, rtol=0.03)
 
 
 def test_one_step_alone_has_a_speed():
