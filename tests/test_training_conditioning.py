@@ -1,12 +1,14 @@
 """The token sequence: layout, coordinates, clean tokens; the same in training and in sampling."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from diffusers.pipelines.ltx.pipeline_ltx_condition import LTXConditionPipeline
 from training_fixtures import one_thread, tiny_config, tiny_job  # noqa: F401
 
 from labeling.errors import ConfigError, DataError
-from training.backbone import LatentGeometry, SamplingSettings, StageInputs, TextEmbedding
+from training.backbone import LatentGeometry, SamplingSettings, StageInputs, TextEmbedding, pad_text
 from training.backbones import load_backbone
 from training.batches import TrainingItems
 from training.conditioning import (
@@ -127,6 +129,28 @@ def test_training_and_sampling_feed_the_same_tokens_at_the_same_sigma(stage, tin
         assert trained.keys() == drawn.keys()
         for name, value in trained.items():
             torch.testing.assert_close(drawn[name], value, rtol=0, atol=1e-5 if name == "hidden_states" else 0)
+
+
+def test_guidance_goes_from_the_empty_texts_velocity_through_the_texts(tiny_job) -> None:  # noqa: F811
+    """One Euler step is linear in the velocity: 0 is the empty text's, 1 the text's, 3 on the line through both."""
+    config = tiny_config("motion")
+    backbone = load_backbone(config.backbone)
+    store = open_store(tiny_job, config.backbone)
+    key, empty = store.keys("train")[0], store.text("")
+    item = TrainingItems(store, store.keys("train"), config).item(key, "guided", held_out=True)
+    empty_BLD, empty_mask_BL = pad_text([empty], length=config.backbone.text_tokens)
+    silent = replace(item.inputs, text_BLD=empty_BLD, text_mask_BL=empty_mask_BL)
+
+    def sampled(inputs: StageInputs, guidance: float) -> torch.Tensor:
+        settings = SamplingSettings(steps=1, guidance=guidance)
+        return backbone.sample(inputs, noise_BCFHW=item.noise_BCFHW, empty_text=empty, settings=settings)
+
+    without, with_text = sampled(silent, 1.0), sampled(item.inputs, 1.0)
+    assert float((with_text - without).abs().max()) > 1e-3
+    torch.testing.assert_close(sampled(item.inputs, 0.0), without, rtol=0, atol=1e-5)
+    # 1 itself is a shortcut past the formula.
+    torch.testing.assert_close(sampled(item.inputs, 1 + 1e-6), with_text, rtol=0, atol=1e-5)
+    torch.testing.assert_close(sampled(item.inputs, 3.0), without + 3 * (with_text - without), rtol=0, atol=1e-4)
 
 
 def test_released_coordinates_change_what_the_sampler_feeds() -> None:
