@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from training_fixtures import (  # noqa: F401
     HEIGHT,
     PICTURE,
@@ -99,6 +100,22 @@ def test_the_motion_latents_pass_to_the_appearance_stage_undecoded(generator, mo
     generator.sample(conditions, settings=FAST)
     assert given["appearance"]["skeleton"] is drawn["motion"]
     assert set(given["motion"]) == {"image"}
+
+
+def test_each_stage_starts_from_noise_of_its_own(generator, monkeypatch) -> None:
+    started: list[torch.Tensor] = []
+    real = generator.backbone.sample
+
+    def watched(*given, noise_BCFHW, **named):
+        started.append(noise_BCFHW)
+        return real(*given, noise_BCFHW=noise_BCFHW, **named)
+
+    monkeypatch.setattr(generator.backbone, "sample", watched)
+    conditions = ClipConditions(image=IMAGE, caption="A road.", first_control=SKELETON)
+    generator.sample(conditions, settings=FAST)
+    motion, appearance = started
+    assert motion.shape == appearance.shape
+    assert abs(float(torch.corrcoef(torch.stack([motion.flatten(), appearance.flatten()]))[0, 1])) < 0.2
 
 
 def test_conditions_change_the_sample_and_their_absence_is_a_condition_too(generator) -> None:
