@@ -419,6 +419,24 @@ def test_conditions_come_with_their_own_probabilities_and_together(tiny_job: Pat
     assert dropped == pytest.approx(0.1, abs=0.03)
 
 
+def test_the_skeletons_noise_is_not_the_targets_noise(tiny_job: Path, monkeypatch) -> None:  # noqa: F811
+    """Else the network could read the noise that it is to find off its condition."""
+    config = tiny_config("appearance", targeted_noise={"omega_max": 0.5})
+    store = open_store(tiny_job, config.backbone)
+    given: list[torch.Tensor] = []
+
+    def watched(latents: torch.Tensor, *_: Any, noise_CFHW: torch.Tensor, **__: Any) -> torch.Tensor:
+        given.append(noise_CFHW)
+        return latents
+
+    monkeypatch.setattr("training.batches.add_targeted_noise", watched)
+    item = TrainingItems(store, store.keys("train"), config).item(store.keys("train")[0], 1)
+    (noise,) = given
+    target = item.noise_BCFHW[0]
+    assert noise.shape == target.shape
+    assert abs(float(torch.corrcoef(torch.stack([noise.flatten(), target.flatten()]))[0, 1])) < 0.2
+
+
 def test_batches_hold_one_layout_and_keep_every_sample(tiny_job: Path) -> None:  # noqa: F811
     config = tiny_config("motion")
     store = open_store(tiny_job, config.backbone)
@@ -455,6 +473,25 @@ def test_bfloat16_base_trains_float32_adapters(tmp_path: Path) -> None:
     frozen = [one for one in trainer.backbone.denoiser.parameters() if not one.requires_grad]
     assert {one.dtype for one in frozen} == {torch.bfloat16}
     assert losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize("limit", [1e-4, 0.0], ids=["clipped", "no limit"])
+def test_gradients_are_clipped_to_the_limit_and_told_as_they_were(
+    limit: float, tiny_job: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
+    config = tiny_config("motion", optimiser={"steps": 2, "max_gradient_norm": limit})
+    trainer = Trainer(config, data=tiny_job, out=tmp_path, quiet=True)
+    used: list[float] = []
+
+    def watch(*_: Any) -> None:
+        gradients = [one.grad for one in trainer.parameters if one.grad is not None]
+        used.append(float(torch.nn.utils.get_total_norm(gradients)))
+
+    trainer.optimiser.register_step_pre_hook(watch)
+    trainer.run()
+    told = [line["gradient_norm"] for line in read_metrics(tmp_path) if "gradient_norm" in line]
+    assert len(told) == 2 and min(told) > 1e-3
+    assert used == pytest.approx([limit] * 2 if limit else told, rel=1e-2 if limit else 1e-5)
 
 
 def test_fetching_ahead_keeps_order_and_errors() -> None:
