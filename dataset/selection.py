@@ -185,11 +185,8 @@ def select_clips(
     Raises:
         ConfigError: ``extend`` without a selection or after the rule has changed, or a split that lacks a video.
     """
-    if mode == "extend" and (previous is None or previous.rule_digest != rule_digest):
-        raise ConfigError(
-            "there is no selection to extend" + (", or its rule has changed" if previous else "")
-            + "; run `animatic select` or `animatic select --refreeze`"
-        )  # fmt: skip
+    if mode == "extend":
+        check_extendable(previous, rule_digest)
     if previous is not None and mode != "refreeze" and previous.rule_digest == rule_digest:
         return _extended(candidates, rule, previous, digests)
     free = [row for rows in candidates.values() for row in rows if row.kept]
@@ -204,6 +201,15 @@ def select_clips(
         digests=dict(digests),
         rule_digest=rule_digest,
     )
+
+
+def check_extendable(previous: Selection | None, rule_digest: str) -> None:
+    """Raise ``ConfigError`` where there is no selection so far, or it was made by another rule."""
+    if previous is None or previous.rule_digest != rule_digest:
+        raise ConfigError(
+            "there is no selection to extend" + (", or its rule has changed" if previous else "")
+            + "; run `animatic select` or `animatic select --refreeze`"
+        )  # fmt: skip
 
 
 def _extended(

@@ -20,7 +20,7 @@ from pipelines.job import Job, find_videos, open_job, open_or_create
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
 from pipelines.layout import SELECTION
 from pipelines.stage import COMMAND_STAGES, Part, parse_part
-from pipelines.stages_select import NO_DETECTOR, job_extractors
+from pipelines.stages_select import NO_DETECTOR, job_extractors, refuse_extend
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,6 +107,8 @@ def run_select(out: Path, *, extend: bool = False, refreeze: bool = False, worke
     reporter = ConsoleReporter()
     job = open_job(out)
     job.selection_mode = "extend" if extend else "refreeze" if refreeze else "auto"
+    if extend:
+        refuse_extend(job)
     with Engine(job.root, workers=0 if workers is None else workers) as engine:
         reports = run_stages(job, ("select",), engine, reporter, refreeze=refreeze or extend)
     if reports[-1].failed and reports[-1].failed[0].reason == ConfigError.reason:

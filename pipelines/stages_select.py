@@ -11,6 +11,7 @@ from dataset.selection import (
     ClipRow,
     SelectionRule,
     candidate_rows,
+    check_extendable,
     count_objects,
     plan_looks,
     read_selection,
@@ -192,15 +193,29 @@ class SelectStage:
             keep_share=settings.keep_share, seed=settings.seed, sample_clips=settings.sample_clips,
             val_share=settings.val_share, split=split,
         )  # fmt: skip
-        # A split that names more videos than before is no other rule.
-        rule_values = {**item.settings["select"], "split": split is not None}
         selection = select_clips(
             candidates, rule, digests={video_id: digest(facts) for video_id, facts in videos.items()},
-            rule_digest=digest([item.version, {**item.settings, "select": rule_values}]),
-            previous=_previous(root), mode=item.payload["mode"],
+            rule_digest=_rule_digest(item), previous=_previous(root), mode=item.payload["mode"],
         )  # fmt: skip
         write_selection(staging / SELECTION, selection)
         return {"clips": len(selection.rows), "kept": len(selection.kept), "threshold": selection.threshold}
+
+
+def refuse_extend(job: Job) -> None:
+    """Say before anything runs that a selection cannot be extended: a receipt of that would stand in the way of others.
+
+    Raises:
+        ConfigError: there is no selection, or its rule has changed.
+        NotReadyError: some video is not counted yet.
+    """
+    for item in job.plan(SelectStage.name):
+        check_extendable(_previous(job.root), _rule_digest(item))
+
+
+def _rule_digest(item: WorkItem) -> str:
+    """What a frozen selection rests on besides the videos; a split that names more of them is no other rule."""
+    rule = {**item.settings["select"], "split": item.settings["select"]["split"] is not None}
+    return digest([item.version, {**item.settings, "select": rule}])
 
 
 def clip_plan(index: VideoIndex, clip: ClipSettings, leave_out_s: tuple[float, float]) -> tuple[Timeline, ClipPlan]:

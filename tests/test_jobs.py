@@ -1,0 +1,49 @@
+"""A job's sources and its selection across commands: what is kept, what is refused, and what is said of it."""
+
+import pytest
+from pipeline_fixtures import run_all, small_config, write_detector, write_street
+
+from dataset.receipts import read_receipts
+from dataset.selection import read_selection
+from labeling.errors import ConfigError
+from pipelines.commands import run_select
+from pipelines.config import merged
+from pipelines.job import Job, Source
+
+UP_TO_COUNT = ("source", "index", "count")
+UP_TO_SELECT = (*UP_TO_COUNT, "select")
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("videos")
+    for number, level in enumerate((60, 120, 230)):
+        write_street(folder / f"v{number}.mp4", frames=24, level=level, seed=number)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def detector(tmp_path_factory):
+    return write_detector(tmp_path_factory.mktemp("models"))
+
+
+def ranked_job(root, videos, detector):
+    """Three videos of which the brightest holds most."""
+    sources = {path.stem: Source(video_id=path.stem, path=path) for path in sorted(videos.glob("*.mp4"))}
+    config = small_config(select={"keep_share": 0.3}, keypoints={"extractors": []}, count={"detector": "counter"})
+    return Job(root, config, sources, models_dir=detector)
+
+
+@pytest.mark.parametrize("before", ["another rule", "no selection"])
+def test_a_refused_extension_leaves_nothing_behind(tmp_path, videos, detector, before):
+    job = ranked_job(tmp_path / "J", videos, detector)
+    run_all(job, stages=UP_TO_SELECT if before == "another rule" else UP_TO_COUNT)
+    job.config = merged(job.config, {"select": {"keep_share": 0.9}})
+    job.save()
+    receipts = read_receipts(job.root, "select")
+    with pytest.raises(ConfigError, match="no selection to extend"):
+        run_select(job.root, extend=True)
+    assert read_receipts(job.root, "select") == receipts
+    assert run_select(job.root) == 0
+    assert run_select(job.root, extend=True) == 0
+    assert len({row.video_id for row in read_selection(job.root / "selection.parquet").kept}) == 3
