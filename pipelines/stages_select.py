@@ -248,11 +248,17 @@ def _candidates(
 
 
 def _refuse_passing_failures(job: Job) -> None:
-    """A threshold frozen without the videos that found no space would be another one than theirs."""
+    """A threshold frozen without the videos that failed for the moment (no space, no memory) would be another one.
+
+    A fault of the program is retried too, but as a rule fails again: one such video must not stop all the others.
+    """
     for stage in ("source", "index", "count"):
         for receipt in job.settled(stage).values():
-            if receipt.state == "failed" and receipt.reason == "storage":
-                raise NotReadyError(f"{receipt.item} is not counted: {receipt.message}")
+            if receipt.state == "failed" and receipt.retryable and receipt.reason != "fault":
+                raise NotReadyError(
+                    f"{receipt.item} is not counted: {receipt.message}; run the command again, or take the video out "
+                    f"of {job.root / 'job.yaml'} to go on without it"
+                )
 
 
 def _previous(root: Path) -> Any:

@@ -1,14 +1,17 @@
 """A job's sources and its selection across commands: what is kept, what is refused, and what is said of it."""
 
+from dataclasses import replace
+
 import pytest
 from pipeline_fixtures import run_all, small_config, write_detector, write_street
 
-from dataset.receipts import read_receipts
+from dataset.receipts import ReceiptLog, read_receipts
 from dataset.selection import read_selection
 from labeling.errors import ConfigError
 from pipelines.commands import run_select
 from pipelines.config import merged
 from pipelines.job import Job, Source
+from pipelines.stage import NotReadyError
 
 UP_TO_COUNT = ("source", "index", "count")
 UP_TO_SELECT = (*UP_TO_COUNT, "select")
@@ -47,3 +50,35 @@ def test_a_refused_extension_leaves_nothing_behind(tmp_path, videos, detector, b
     assert run_select(job.root) == 0
     assert run_select(job.root, extend=True) == 0
     assert len({row.video_id for row in read_selection(job.root / "selection.parquet").kept}) == 3
+
+
+@pytest.fixture(scope="module")
+def counted_job(tmp_path_factory, videos, detector):
+    job = ranked_job(tmp_path_factory.mktemp("jobs") / "J", videos, detector)
+    run_all(job, stages=UP_TO_COUNT)
+    return job
+
+
+def fail_count(job, video_id, *, reason, retryable):
+    """Another receipt for a video's count, as a failure of that kind leaves it."""
+    receipt = read_receipts(job.root, "count")[video_id]
+    failure = replace(
+        receipt, state="failed", reason=reason, message=f"fails by {reason}", retryable=retryable,
+        turn=receipt.turn + 1, outputs=(), facts={},
+    )  # fmt: skip
+    ReceiptLog(job.root, "count").append(failure)
+    job.refresh()
+
+
+@pytest.mark.parametrize("reason", ["storage", "memory", "died", "interrupted"])
+def test_no_threshold_is_frozen_without_a_video_that_failed_for_the_moment(counted_job, reason):
+    fail_count(counted_job, "v2", reason=reason, retryable=True)
+    with pytest.raises(NotReadyError, match=f"v2 is not counted: fails by {reason}; run the command again"):
+        counted_job.plan("select")
+
+
+@pytest.mark.parametrize(("reason", "retryable"), [("video", False), ("fault", True)])
+def test_a_video_that_would_fail_again_does_not_stop_the_selection(counted_job, reason, retryable):
+    fail_count(counted_job, "v2", reason=reason, retryable=retryable)
+    [selection] = counted_job.plan("select")
+    assert set(selection.inputs["videos"]) == {"v0", "v1"}
