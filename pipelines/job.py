@@ -142,12 +142,19 @@ def open_job(root: Path) -> Job:
 
 
 def open_or_create(
-    root: Path, *, videos: Sequence[Source] = (), config: Config | None = None, models_dir: Path | None = None
+    root: Path,
+    *,
+    videos: Sequence[Source] = (),
+    config: Config | None = None,
+    models_dir: Path | None = None,
+    leave_out: Path | None = None,
 ) -> Job:
     """The job in ``root`` with ``videos`` added and, where given, other settings and models. Nothing is written yet.
 
+    Of a video that the job has, all but its path stays as the job has it, unless the table ``leave_out`` names it.
+
     Raises:
-        ConfigError: a video has the id of another one, or no job and no videos.
+        ConfigError: a video has the id of another one, no job and no videos, or a table that cannot be used.
     """
     known = open_job(root) if (root / "job.yaml").is_file() else None
     sources = dict(known.sources) if known else {}
@@ -155,14 +162,16 @@ def open_or_create(
         old = sources.get(source.video_id)
         if old is not None and old.path != source.path and old.path.exists():
             raise ConfigError(_same_id(source.video_id, old.path, source.path))
-        sources[source.video_id] = replace(source, trajectory=old.trajectory if old else None)
+        sources[source.video_id] = replace(old, path=source.path) if old else source
     if not sources:
         raise ConfigError(f"{root}: holds no job and no videos were given; name some VIDEO files or folders")
+    if leave_out is not None:
+        sources = with_leave_out(sources, leave_out)
     models_dir = models_dir.absolute() if models_dir else (known.models_dir if known else None)
     return Job(root, config or (known.config if known else Config()), sources, models_dir=models_dir)
 
 
-def find_videos(arguments: Sequence[Path], *, leave_out: Path | None = None) -> list[Source]:
+def find_videos(arguments: Sequence[Path]) -> list[Source]:
     """The source videos that a person named: files, folders (searched to their depths), text files of paths.
 
     A line of a text file is a path, relative to that file, with an id before it if wanted: ``id<TAB>path``.
@@ -172,22 +181,30 @@ def find_videos(arguments: Sequence[Path], *, leave_out: Path | None = None) -> 
     """
     found = [entry for argument in arguments for entry in _expand(argument)]
     sources: dict[str, Source] = {}
-    spans = read_leave_out(leave_out) if leave_out else {}
     for video_id, path in found:
         check_id(video_id, path)
         old = sources.get(video_id)
         if old is not None and old.path != path:
             raise ConfigError(_same_id(video_id, old.path, path))
-        sources[video_id] = Source(video_id=video_id, path=path, leave_out_s=spans.get(video_id, (0.0, 0.0)))
+        sources[video_id] = Source(video_id=video_id, path=path)
     if sources and not any(source.path.exists() for source in sources.values()):
         missing = next(iter(sources.values())).path
         raise ConfigError(f"{missing}: no such file; check the path")
+    return list(sources.values())
+
+
+def with_leave_out(sources: Mapping[str, Source], table: Path) -> dict[str, Source]:
+    """Sources with what a table (see ``read_leave_out``) leaves out of those that it names; the others as they are.
+
+    Raises:
+        ConfigError: the table cannot be used, or names a video that is none of them.
+    """
+    spans = read_leave_out(table)
     unknown = sorted(set(spans) - set(sources))
     if unknown:
-        raise ConfigError(
-            f"{leave_out}: names {unknown[0]!r}, which is none of the videos; use ids, as {_some(sources)}"
-        )
-    return list(sources.values())
+        raise ConfigError(f"{table}: names {unknown[0]!r}, which is none of the videos; use ids, as {_some(sources)}")
+    named = {video_id: replace(sources[video_id], leave_out_s=span) for video_id, span in spans.items()}
+    return {**sources, **named}
 
 
 def check_id(video_id: str, path: Path) -> None:

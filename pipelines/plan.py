@@ -18,7 +18,7 @@ from labeling.video import probe
 from pipelines.commands import JobOptions, configured
 from pipelines.config import Config
 from pipelines.engine import Engine
-from pipelines.job import Job, Source, find_videos
+from pipelines.job import Job, Source, find_videos, with_leave_out
 from pipelines.label import ALL_STAGES, Reporter, StageReport, run_stages
 from pipelines.stage import Part
 
@@ -86,7 +86,10 @@ def plan_job(
         ConfigError: settings or videos that cannot be used, or no video long enough for a clip.
     """
     config = configured(Config(), options)
-    sources = find_videos(videos, leave_out=options.leave_out)
+    sources = find_videos(videos)
+    if options.leave_out is not None:
+        by_id = {source.video_id: source for source in sources}
+        sources = list(with_leave_out(by_id, options.leave_out).values())
     lengths, broken = _lengths_s(sources)
     candidates = {name: count_candidates(length, config.clip) for name, length in lengths.items()}
     total = sum(candidates.values())

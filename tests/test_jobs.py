@@ -8,9 +8,9 @@ from pipeline_fixtures import run_all, small_config, write_detector, write_stree
 from dataset.receipts import ReceiptLog, read_receipts
 from dataset.selection import read_selection
 from labeling.errors import ConfigError
-from pipelines.commands import run_select
+from pipelines.commands import JobOptions, prepare_job, run_select
 from pipelines.config import merged
-from pipelines.job import Job, Source
+from pipelines.job import Job, Source, open_job
 from pipelines.stage import NotReadyError
 
 UP_TO_COUNT = ("source", "index", "count")
@@ -82,3 +82,39 @@ def test_a_video_that_would_fail_again_does_not_stop_the_selection(counted_job, 
     fail_count(counted_job, "v2", reason=reason, retryable=retryable)
     [selection] = counted_job.plan("select")
     assert set(selection.inputs["videos"]) == {"v0", "v1"}
+
+
+@pytest.fixture
+def two_files(tmp_path):
+    """A folder with two files that are called videos."""
+    folder = tmp_path / "v"
+    folder.mkdir()
+    for name in ("a", "b"):
+        (folder / f"{name}.mp4").write_bytes(b"x")
+    return folder
+
+
+def left_out(root):
+    return {name: source.leave_out_s for name, source in open_job(root).sources.items()}
+
+
+@pytest.mark.parametrize("again", ["with the videos", "without the videos"])
+def test_what_is_left_out_stays_until_a_table_says_otherwise(tmp_path, two_files, again):
+    table, root = tmp_path / "leave_out.csv", tmp_path / "J"
+    videos = [two_files] if again == "with the videos" else []
+    table.write_text("video_id,start_s,end_s\na,1,0.5\nb,2,0\n")
+    prepare_job([two_files], root, JobOptions(leave_out=table))
+    prepare_job(videos, root, JobOptions())
+    assert left_out(root) == {"a": (1.0, 0.5), "b": (2.0, 0.0)}
+    table.write_text("video_id,start_s,end_s\na,0,0\n")
+    prepare_job(videos, root, JobOptions(leave_out=table))
+    assert left_out(root) == {"a": (0.0, 0.0), "b": (2.0, 0.0)}
+
+
+@pytest.mark.parametrize("again", ["with the videos", "without the videos"])
+def test_a_table_that_names_no_video_of_the_job_is_refused(tmp_path, two_files, again):
+    table, root = tmp_path / "leave_out.csv", tmp_path / "J"
+    prepare_job([two_files], root, JobOptions())
+    table.write_text("video_id,start_s,end_s\nc,1,0\n")
+    with pytest.raises(ConfigError, match="names 'c', which is none of the videos; use ids, as 'a', 'b'"):
+        prepare_job([two_files] if again == "with the videos" else [], root, JobOptions(leave_out=table))
