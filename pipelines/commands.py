@@ -122,7 +122,7 @@ def prepare_job(videos: Sequence[Path], out: Path, options: JobOptions) -> Job:
     Raises:
         AnimaticError: settings, videos or a folder that cannot be used.
     """
-    sources = find_videos(videos) if videos else []
+    sources = find_videos(videos, out=out) if videos else []
     job = open_or_create(out, videos=sources, models_dir=options.models, leave_out=options.leave_out)
     config = configured(job.config, options)
     unknown = sorted(set(config.cameras) - set(job.sources))

@@ -2,7 +2,8 @@
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -171,15 +172,16 @@ def open_or_create(
     return Job(root, config or (known.config if known else Config()), sources, models_dir=models_dir)
 
 
-def find_videos(arguments: Sequence[Path]) -> list[Source]:
+def find_videos(arguments: Sequence[Path], *, out: Path | None = None) -> list[Source]:
     """The source videos that a person named: files, folders (searched to their depths), text files of paths.
 
-    A line of a text file is a path, relative to that file, with an id before it if wanted: ``id<TAB>path``.
+    A line of a text file is a path, relative to that file, with an id before it if wanted: ``id<TAB>path``. What a job
+    made is no source: below a folder, ``out`` and every folder that holds a ``job.yaml`` are left out.
 
     Raises:
         ConfigError: nothing there, an id that cannot be used, two videos with one id, or none of them exists.
     """
-    found = [entry for argument in arguments for entry in _expand(argument)]
+    found = [entry for argument in arguments for entry in _expand(argument, out)]
     sources: dict[str, Source] = {}
     for video_id, path in found:
         check_id(video_id, path)
@@ -244,15 +246,34 @@ def _pair(values: Sequence[Any]) -> tuple[float, float]:
     return float(start), float(end)
 
 
-def _expand(argument: Path) -> list[tuple[str, Path]]:
+def _expand(argument: Path, out: Path | None) -> list[tuple[str, Path]]:
     if argument.is_dir():
-        files = sorted(path for path in argument.rglob("*") if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file())
+        if _is_job(argument, out):
+            raise ConfigError(
+                f"{argument}: is a job's own folder; give the folder of the videos, and --out another one (a job that "
+                "is there goes on without any VIDEO)"
+            )
+        files = sorted(_files_below(argument, out))
         if not files:
             raise ConfigError(f"{argument}: holds no videos ({', '.join(sorted(VIDEO_SUFFIXES))}); check the path")
         return [(path.stem, path.absolute()) for path in files]
     if argument.suffix.lower() in _LIST_SUFFIXES and argument.is_file():
         return _read_list(argument)
     return [(argument.stem, argument.absolute())]
+
+
+def _files_below(folder: Path, out: Path | None) -> Iterator[Path]:
+    """Every video file below a folder, but those of jobs."""
+    for place, folders, names in os.walk(folder):
+        here = Path(place)
+        folders[:] = [name for name in folders if not _is_job(here / name, out)]
+        files = (here / name for name in names)
+        yield from (path for path in files if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file())
+
+
+def _is_job(folder: Path, out: Path | None) -> bool:
+    """Whether a folder is a job's, or about to be."""
+    return (folder / "job.yaml").is_file() or (out is not None and folder.resolve() == out.resolve())
 
 
 def _read_list(path: Path) -> list[tuple[str, Path]]:

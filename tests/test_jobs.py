@@ -118,3 +118,23 @@ def test_a_table_that_names_no_video_of_the_job_is_refused(tmp_path, two_files, 
     table.write_text("video_id,start_s,end_s\nc,1,0\n")
     with pytest.raises(ConfigError, match="names 'c', which is none of the videos; use ids, as 'a', 'b'"):
         prepare_job([two_files] if again == "with the videos" else [], root, JobOptions(leave_out=table))
+
+
+def test_a_job_inside_the_videos_folder_takes_nothing_of_a_job_for_a_source(tmp_path, two_files):
+    root, other = two_files / "J", two_files / "deep" / "other"
+    for made in (root / "videos" / "a" / "run_0_9.mp4", other / "videos" / "c" / "run_0_9.mp4"):
+        made.parent.mkdir(parents=True)
+        made.write_bytes(b"x")
+    (two_files / "deep" / "d.mp4").write_bytes(b"x")
+    (other / "job.yaml").touch()
+    for _ in range(2):
+        job = prepare_job([two_files], root, JobOptions())
+        assert list(job.sources) == ["a", "b", "d"]
+
+
+def test_a_job_s_own_folder_is_no_folder_of_videos(tmp_path, two_files):
+    with pytest.raises(ConfigError, match="is a job's own folder"):
+        prepare_job([two_files], two_files, JobOptions())
+    assert list(prepare_job([two_files], tmp_path, JobOptions()).sources) == ["a", "b"], "videos may lie in the job's"
+    with pytest.raises(ConfigError, match="is a job's own folder"):
+        prepare_job([tmp_path], tmp_path / "another", JobOptions())
