@@ -16,7 +16,7 @@ from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, w
 from pipelines.console import ConsoleReporter, print_failures
 from pipelines.engine import Engine
 from pipelines.imports import import_trajectories
-from pipelines.job import Job, find_videos, open_job, open_or_create
+from pipelines.job import Job, absolute, find_videos, open_job, open_or_create
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
 from pipelines.layout import SELECTION
 from pipelines.stage import COMMAND_STAGES, Part, parse_part
@@ -130,7 +130,7 @@ def prepare_job(videos: Sequence[Path], out: Path, options: JobOptions) -> Job:
         raise ConfigError(
             f"cameras: {unknown[0]!r} is none of the videos; use ids, as {', '.join(list(job.sources)[:3])}"
         )
-    job = Job(job.root.absolute(), config, job.sources, models_dir=job.models_dir)
+    job = Job(absolute(job.root), config, job.sources, models_dir=job.models_dir)
     if options.models is not None and not options.models.is_dir():
         raise ConfigError(f"--models {options.models}: is no folder; give the folder that holds the ONNX files")
     with storage_errors(out):
@@ -164,7 +164,7 @@ def configured(config: Config, options: JobOptions) -> Config:
     if options.videos is not None:
         changes["pack"] = {"videos": options.videos}
     if options.captions is not None:
-        changes["views"] = {"captions": str(options.captions.absolute())}
+        changes["views"] = {"captions": str(absolute(options.captions))}
     return merged(config, changes) if changes else config
 
 

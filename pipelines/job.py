@@ -161,14 +161,14 @@ def open_or_create(
     sources = dict(known.sources) if known else {}
     for source in videos:
         old = sources.get(source.video_id)
-        if old is not None and old.path != source.path and old.path.exists():
+        if old is not None and absolute(old.path) != absolute(source.path) and old.path.exists():
             raise ConfigError(_same_id(source.video_id, old.path, source.path))
         sources[source.video_id] = replace(old, path=source.path) if old else source
     if not sources:
         raise ConfigError(f"{root}: holds no job and no videos were given; name some VIDEO files or folders")
     if leave_out is not None:
         sources = with_leave_out(sources, leave_out)
-    models_dir = models_dir.absolute() if models_dir else (known.models_dir if known else None)
+    models_dir = absolute(models_dir) if models_dir else (known.models_dir if known else None)
     return Job(root, config or (known.config if known else Config()), sources, models_dir=models_dir)
 
 
@@ -207,6 +207,11 @@ def with_leave_out(sources: Mapping[str, Source], table: Path) -> dict[str, Sour
         raise ConfigError(f"{table}: names {unknown[0]!r}, which is none of the videos; use ids, as {_some(sources)}")
     named = {video_id: replace(sources[video_id], leave_out_s=span) for video_id, span in spans.items()}
     return {**sources, **named}
+
+
+def absolute(path: Path) -> Path:
+    """A path from the root, without ``..``, so that a file has one name by every route; links keep theirs."""
+    return Path(os.path.normpath(path.absolute()))
 
 
 def check_id(video_id: str, path: Path) -> None:
@@ -256,10 +261,10 @@ def _expand(argument: Path, out: Path | None) -> list[tuple[str, Path]]:
         files = sorted(_files_below(argument, out))
         if not files:
             raise ConfigError(f"{argument}: holds no videos ({', '.join(sorted(VIDEO_SUFFIXES))}); check the path")
-        return [(path.stem, path.absolute()) for path in files]
+        return [(path.stem, absolute(path)) for path in files]
     if argument.suffix.lower() in _LIST_SUFFIXES and argument.is_file():
         return _read_list(argument)
-    return [(argument.stem, argument.absolute())]
+    return [(argument.stem, absolute(argument))]
 
 
 def _files_below(folder: Path, out: Path | None) -> Iterator[Path]:
@@ -286,7 +291,7 @@ def _read_list(path: Path) -> list[tuple[str, Path]]:
         video_id, tab, name = line.strip().rpartition("\t")
         if not name.strip() or line.lstrip().startswith("#"):
             continue
-        video = (path.parent / name.strip()).absolute()
+        video = absolute(path.parent / name.strip())
         entries.append((video_id.strip() if tab else video.stem, video))
     if not entries:
         raise ConfigError(f"{path}: lists no videos; give a path on each line")

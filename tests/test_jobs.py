@@ -1,6 +1,7 @@
 """A job's sources and its selection across commands: what is kept, what is refused, and what is said of it."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from pipeline_fixtures import run_all, small_config, write_detector, write_street
@@ -138,3 +139,31 @@ def test_a_job_s_own_folder_is_no_folder_of_videos(tmp_path, two_files):
     assert list(prepare_job([two_files], tmp_path, JobOptions()).sources) == ["a", "b"], "videos may lie in the job's"
     with pytest.raises(ConfigError, match="is a job's own folder"):
         prepare_job([tmp_path], tmp_path / "another", JobOptions())
+
+
+def test_a_video_by_another_route_is_the_same_video(tmp_path, two_files, monkeypatch):
+    (tmp_path / "sub").mkdir()
+    monkeypatch.chdir(tmp_path / "sub")
+    paths = tmp_path / "sub" / "paths.txt"
+    paths.write_text("../v/a.mp4\n")
+    root, routes = tmp_path / "J", [two_files, Path("../v"), Path("../v/a.mp4"), paths]
+    for videos in (*([route] for route in routes), routes):
+        job = prepare_job(videos, root, JobOptions())
+        assert {name: source.path for name, source in job.sources.items()} == {
+            name: two_files / f"{name}.mp4" for name in ("a", "b")
+        }
+
+
+def test_a_job_that_holds_a_path_with_dots_knows_its_video_again(tmp_path, two_files):
+    root = tmp_path / "J"
+    sources = {name: Source(video_id=name, path=root / ".." / "v" / f"{name}.mp4") for name in ("a", "b")}
+    root.mkdir()
+    Job(root, small_config(), sources).save()
+    assert prepare_job([two_files], root, JobOptions()).sources["a"].path == two_files / "a.mp4"
+
+
+def test_a_link_keeps_its_name(tmp_path, two_files):
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "day.mp4").symlink_to(two_files / "a.mp4")
+    job = prepare_job([tmp_path / "links"], tmp_path / "J", JobOptions())
+    assert job.sources["day"].path == tmp_path / "links" / "day.mp4"
