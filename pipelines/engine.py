@@ -122,7 +122,9 @@ def _disk_full(receipt: Receipt, root: Path) -> bool:
     """Whether an item failed for want of space for all, rather than for its own sake (as a limit on file sizes)."""
     if receipt.state != "failed" or receipt.reason != StorageError.reason:
         return False
-    return "no space left" in receipt.message.lower() or shutil.disk_usage(root).free < _LEAST_FREE_BYTES
+    message = receipt.message.lower()
+    told = any(words in message for words in ("no space left", "quota exceeded"))
+    return told or shutil.disk_usage(root).free < _LEAST_FREE_BYTES
 
 
 def _ready(busy: Sequence["_Worker"]) -> list["_Worker"]:

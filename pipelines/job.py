@@ -127,19 +127,29 @@ def open_job(root: Path) -> Job:
     if not path.is_file():
         raise ConfigError(f"{root}: holds no job.yaml; make a job with `animatic label VIDEO... --out {root}`")
     values = read_yaml(path)
-    sources = {
-        name: Source(
-            video_id=name,
-            path=Path(entry["path"]),
-            leave_out_s=_pair(entry.get("leave_out_s", (0, 0))),
-            trajectory=ImportedTrajectory(**entry["trajectory"]) if "trajectory" in entry else None,
-        )
-        for name, entry in (values.get("videos") or {}).items()
-    }
-    models = values.get("models")
-    return Job(
-        root, parse_config(values.get("config") or {}, str(path)), sources, models_dir=Path(models) if models else None
-    )
+    videos, config, models = values.get("videos") or {}, values.get("config") or {}, values.get("models")
+    for key, part in (("videos", videos), ("config", config)):
+        if not isinstance(part, dict):
+            raise ConfigError(f"{path}: {key} needs a mapping, holds {part!r}; mend it")
+    if not isinstance(models, str | None):
+        raise ConfigError(f"{path}: models needs a folder's path, holds {models!r}; mend it")
+    sources = {name: _read_source(path, name, entry) for name, entry in videos.items()}
+    return Job(root, parse_config(config, str(path)), sources, models_dir=Path(models) if models else None)
+
+
+def _read_source(job_file: Path, video_id: Any, entry: Any) -> Source:
+    try:
+        check_video_id(video_id)
+        leave_out_s = _pair(entry.get("leave_out_s", (0, 0)))
+        if not _are_lengths(leave_out_s):
+            raise ValueError(f"leave_out_s holds {leave_out_s}, no two lengths of time")
+        trajectory = ImportedTrajectory(**entry["trajectory"]) if "trajectory" in entry else None
+        return Source(video_id=video_id, path=Path(entry["path"]), leave_out_s=leave_out_s, trajectory=trajectory)
+    except Exception as error:
+        raise ConfigError(
+            f"{job_file}: videos: {video_id!r} cannot be {entry!r} ({error}); give it a path and, if wanted, "
+            "leave_out_s: [START, END]"
+        ) from error
 
 
 def open_or_create(
@@ -236,7 +246,7 @@ def read_leave_out(path: Path) -> dict[str, tuple[float, float]]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             for number, row in enumerate(csv.DictReader(stream), start=2):
                 span = _pair((row["start_s"] or 0, row["end_s"] or 0))
-                if not all(0 <= value < math.inf for value in span) or row["video_id"] in spans:
+                if not _are_lengths(span) or row["video_id"] in spans:
                     raise ValueError(f"line {number} repeats a video or is no length of time")
                 spans[row["video_id"]] = span
     except KeyError as error:
@@ -249,6 +259,10 @@ def read_leave_out(path: Path) -> dict[str, tuple[float, float]]:
 def _pair(values: Sequence[Any]) -> tuple[float, float]:
     start, end = values
     return float(start), float(end)
+
+
+def _are_lengths(values: Sequence[float]) -> bool:
+    return all(0 <= value < math.inf for value in values)
 
 
 def _expand(argument: Path, out: Path | None) -> list[tuple[str, Path]]:

@@ -1,5 +1,6 @@
 """The pool with stages made for the test: what a worker's death, a full disk or a fault leave behind."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -40,6 +41,8 @@ class ToyStage:
             raise VideoError(f"{item.name}: is no video")
         if action == "fault":
             raise ValueError("a bug")
+        if action == "quota":
+            raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), str(staging / "x"))
         if action == "full":
             raise OSError(28, "No space left on device", str(staging / "x"))
         if action == "slow":
@@ -113,8 +116,9 @@ def test_what_goes_wrong_is_in_the_receipt(tmp_path, action, state, reason, retr
     assert item_state(item(do=action), read_receipts(tmp_path, "toy")["a"], tmp_path) == expected
 
 
-def test_a_full_disk_stops_the_stage(tmp_path):
-    made = run(tmp_path, [item("a"), item("b", do="full"), item("c")])
+@pytest.mark.parametrize("action", ["full", "quota"])
+def test_a_full_disk_stops_the_stage(tmp_path, action):
+    made = run(tmp_path, [item("a"), item("b", do=action), item("c")])
     assert [made[name].state for name in made] == ["done", "failed"]
     assert "free some space" in made["b"].message
 

@@ -1,5 +1,6 @@
 """A job's sources and its selection across commands: what is kept, what is refused, and what is said of it."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -167,3 +168,27 @@ def test_a_link_keeps_its_name(tmp_path, two_files):
     (tmp_path / "links" / "day.mp4").symlink_to(two_files / "a.mp4")
     job = prepare_job([tmp_path / "links"], tmp_path / "J", JobOptions())
     assert job.sources["day"].path == tmp_path / "links" / "day.mp4"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("videos: {v0: null}", "'v0' cannot be None"),
+        ("videos: {v0: {leave_out_s: [1, 2]}}", "'v0' cannot be"),
+        ("videos: {v0: {path: null}}", "'v0' cannot be"),
+        ("videos: {v0: {path: a.mp4, leave_out_s: 3}}", "'v0' cannot be"),
+        ("videos: {v0: {path: a.mp4, leave_out_s: [1, -2]}}", "no two lengths of time"),
+        ("videos: {v0: {path: a.mp4, trajectory: a.tum}}", "'v0' cannot be"),
+        ("videos: {v0: {path: a.mp4, trajectory: {flie: a.tum}}}", "flie"),
+        ("videos: {../v0: {path: a.mp4}}", "'../v0' cannot be"),
+        ("videos: {1: {path: a.mp4}}", "1 cannot be"),
+        ("videos: [a.mp4]", "videos needs a mapping"),
+        ("config: 3", "config needs a mapping"),
+        ("models: 3", "models needs a folder's path"),
+    ],
+)
+def test_a_job_file_that_cannot_be_used_is_an_error_that_names_it(tmp_path, text, message):
+    (tmp_path / "job.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(message)) as caught:
+        open_job(tmp_path)
+    assert str(tmp_path / "job.yaml") in str(caught.value)
