@@ -231,7 +231,7 @@ class _Channel:
         self._turn(views, number)
         seen = [replace(label, frame=number) for label in self.look.see(views.frame, views.number)]
         carried = self._between.carried(number)
-        named = self._tracker.identify(seen, frame=number, previous_to_current=self._turned, carried=carried)
+        named = self._tracker.update(seen, frame=number, previous_to_current=self._turned, carried=carried)
         self._looks.append(TrackedLook(frame=number, labels=tuple(named), turn=self._turned))
         seen = [label for label in named if label.track_id != UNTRACKED]
         self._turned = np.eye(3)

@@ -55,18 +55,6 @@ class RunTracker:
         previous_to_current: np.ndarray | None = None,
         carried: Mapping[int, np.ndarray] | None = None,
     ) -> list[Keypoints]:
-        """As ``identify``, without the labels that belong to no track."""
-        named = self.identify(labels, frame=frame, previous_to_current=previous_to_current, carried=carried)
-        return [label for label in named if label.track_id != UNTRACKED]
-
-    def identify(
-        self,
-        labels: Sequence[Keypoints],
-        *,
-        frame: int,
-        previous_to_current: np.ndarray | None = None,
-        carried: Mapping[int, np.ndarray] | None = None,
-    ) -> list[Keypoints]:
         """One frame's labels with their ids, ``UNTRACKED`` where they belong to no track.
 
         Args:
@@ -93,28 +81,6 @@ class RunTracker:
             return LaneTracker()
         sure = self._sure_scores.get(category, self._settings.high_score)
         return BoxTracker(replace(self._settings, high_score=sure))
-
-
-def assign_tracks(
-    frames: Sequence[Sequence[Keypoints]],
-    *,
-    settings: TrackerSettings | None = None,
-    breaks: frozenset[int] = frozenset(),
-) -> list[list[Keypoints]]:
-    """Labels of consecutive frames with track ids, those that belong to no track left out.
-
-    Args:
-        frames: the labels of consecutive frames.
-        settings: thresholds.
-        breaks: positions in ``frames`` before which nothing may be carried over (a hard cut, a hole).
-    """
-    tracker = RunTracker(settings)
-    tracked = []
-    for position, labels in enumerate(frames):
-        if position in breaks:
-            tracker.restart()
-        tracked.append(tracker.update(labels, frame=position))
-    return tracked
 
 
 def believed_tracks(

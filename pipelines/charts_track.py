@@ -16,7 +16,7 @@ from labeling.box_tracker import TrackerSettings
 from labeling.boxes import iou
 from labeling.efforts import EFFORTS, EffortSettings
 from labeling.extraction import label_with
-from labeling.labels import Keypoints
+from labeling.labels import UNTRACKED, Keypoints
 from labeling.observation import Look, looks_of
 from labeling.picture_turn import picture_turn, turn_view
 from labeling.schemas import Category
@@ -59,16 +59,19 @@ class TrackClip:
 
     def look(self) -> Look:
         """The same looks again, at no cost."""
-        return _Remembered(self)
+        return Remembered(self.looks, self.sure_scores)
 
 
-class _Remembered:
+class Remembered:
+    """A ``Look`` that tells what was seen in each frame again, at no cost."""
+
     carries = True
 
-    def __init__(self, clip: TrackClip) -> None:
-        self.looks, self.sure_scores = clip.looks, clip.sure_scores
+    def __init__(self, looks: Sequence[Sequence[Keypoints]], sure_scores: Mapping[str, float]) -> None:
+        self.looks, self.sure_scores = looks, sure_scores
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
+        """As ``Look.see``."""
         return list(self.looks[number])
 
 
@@ -154,7 +157,8 @@ def tracked(clip: TrackClip, *, turns: bool = True, settings: TrackerSettings | 
         turn = (
             picture_turn(before, view, width=width, height=height) if before is not None and view is not None else None
         )
-        found += tracker.update(labels, frame=number, previous_to_current=turn)
+        named = tracker.update(labels, frame=number, previous_to_current=turn)
+        found += [label for label in named if label.track_id != UNTRACKED]
     return found
 
 

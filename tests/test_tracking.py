@@ -12,7 +12,7 @@ from labeling.box_tracker import BoxTracker, TrackerSettings
 from labeling.boxes import iou
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.lane_tracker import LaneTracker, line_distance
-from labeling.tracking import RunTracker, TrackedLook, assign_tracks, believed_tracks, drop_brief_tracks
+from labeling.tracking import RunTracker, TrackedLook, believed_tracks, drop_brief_tracks
 
 
 def box(x: float, y: float = 300, *, width: float = 40, height: float = 100) -> np.ndarray:
@@ -118,7 +118,8 @@ def test_unsure_boxes_continue_a_track_but_start_none() -> None:
 def test_each_category_may_be_sure_at_a_score_of_its_own() -> None:
     for sure, begun in ((0.95, 0), (0.85, 1)):
         tracker = RunTracker(sure_scores={"car": sure})
-        assert len(tracker.update([car(0, 100)], frame=0)) == begun
+        (named,) = tracker.update([car(0, 100)], frame=0)
+        assert (named.track_id != UNTRACKED) is bool(begun)
 
 
 def test_frame_steps_scale_the_prediction() -> None:
@@ -157,18 +158,21 @@ def car(frame: int, x: float) -> Keypoints:
 
 
 def test_nothing_is_carried_over_a_break() -> None:
-    frames = [[car(t, 100 + t)] for t in range(10)]
-    whole = assign_tracks(frames)
-    cut = assign_tracks(frames, breaks=frozenset({5}))
-    assert {label.track_id for labels in whole for label in labels} == {0}
-    assert [labels[0].track_id for labels in cut] == [0] * 5 + [1] * 5
+    """Ids go on counting, so that no two objects of a run share one."""
+    for cut, ids in ((None, [0] * 10), (5, [0] * 5 + [1] * 5)):
+        tracker, found = RunTracker(), []
+        for t in range(10):
+            if t == cut:
+                tracker.restart()
+            found += tracker.update([car(t, 100 + t)], frame=t)
+        assert [label.track_id for label in found] == ids
 
 
 def looks(*frames: list[Keypoints]) -> list[TrackedLook]:
     """What an association of these looks gives, one a frame."""
     tracker = RunTracker()
     return [
-        TrackedLook(frame=t, labels=tuple(tracker.identify(labels, frame=t)), turn=np.eye(3))
+        TrackedLook(frame=t, labels=tuple(tracker.update(labels, frame=t)), turn=np.eye(3))
         for t, labels in enumerate(frames)
     ]
 
@@ -223,7 +227,7 @@ def test_reaching_back_follows_a_camera_that_turns() -> None:
     tracker = RunTracker()
     seen = [
         TrackedLook(
-            frame=t, labels=tuple(tracker.identify([label], frame=t, previous_to_current=shift)),
+            frame=t, labels=tuple(tracker.update([label], frame=t, previous_to_current=shift)),
             turn=shift,
         )
         for t, label in enumerate(labels)

@@ -10,7 +10,7 @@ nothing else but lower or more hidden ones. All efforts get the same looks.
 import argparse
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,8 +22,8 @@ import numpy as np
 from dataset.street import Street
 from labeling.efforts import Effort
 from labeling.extraction import label_with
-from labeling.labels import Keypoints
 from labeling.observation import looks_of
+from pipelines.charts_track import Remembered
 from pipelines.keypoint_clips import street_extractors
 from pipelines.keypoint_errors import MatchedFrame, match_frames
 from pipelines.track_errors import NO_TRACKS, TrackScore, track_score
@@ -34,19 +34,6 @@ from training.street_scores import grouped_standard_error
 FRAMES = 37
 SINGLE = "single frames"
 RESULT = Path(__file__).parent / "results" / "bench_counts.json"
-
-
-class Remembered:
-    """What was seen in each frame, again and again at no cost."""
-
-    carries = True
-
-    def __init__(self, seen: Sequence[list[Keypoints]], sure_scores: Mapping[str, float]) -> None:
-        self.seen, self.sure_scores = seen, sure_scores
-
-    def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
-        """As ``Look.see``."""
-        return list(self.seen[number])
 
 
 def judge_street(plan: RenderPlan) -> dict[str, tuple[list[bool], TrackScore]]:
