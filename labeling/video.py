@@ -20,7 +20,7 @@ from labeling.camera import PictureMap
 from labeling.conversion import FrameConverter, OutputPicture, colour_matrix, deinterlaced, is_full_range
 from labeling.encoding import EncoderSettings, VideoWriter, copy_packets, lossless_rgb
 from labeling.errors import VideoError
-from labeling.mp4_boxes import is_cut_off
+from labeling.packet_times import HOLE_S, PacketTimes, read_packet_times
 from labeling.sources import SAME_TIME_S, open_video, pick_video_stream, read_packets, read_packets_from, seconds
 
 __all__ = [
@@ -42,8 +42,6 @@ __all__ = [
     "source_frames",
 ]
 
-HOLE_S = 0.25
-"""A longer gap between source frames is a hole."""
 _B_FRAME = 3
 _PROBED_FRAMES = 3
 
@@ -74,18 +72,6 @@ class VideoInfo:
     interlaced: bool
     focal_35mm: float | None = None
     """Focal length for a picture with the diagonal of 35 mm film, mm, where the file's metadata say it."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PacketTimes:
-    """When a video's frames are shown, read from packets alone."""
-
-    times_s: np.ndarray
-    """(N,) float64, strictly increasing presentation times."""
-    is_keyframe: np.ndarray
-    """(N,) bool."""
-    broken_packets: int
-    """Packets that could not be read whole; their frames are not among ``times_s``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -134,51 +120,6 @@ def probe(path: Path) -> VideoInfo:
         if not pictures:
             raise VideoError(f"{path}: not one frame can be decoded ({stream.codec.name}); get the file again")
         return _video_info(path, container, stream, pictures)
-
-
-def read_packet_times(path: Path) -> PacketTimes:
-    """Every frame's presentation time, without decoding one.
-
-    Raises:
-        VideoError: as ``probe``, or packets that carry no presentation times, or times that start again: recordings
-            joined into one file, of which all but one would be lost.
-    """
-    path = Path(path)
-    times: dict[float, bool] = {}
-    broken = untimed = 0
-    newest_key_s = -math.inf
-    with open_video(path) as container:
-        stream = pick_video_stream(container, path)
-        for packet in read_packets(container, stream):
-            if packet is None or packet.is_corrupt:
-                broken += 1
-            elif packet.size and not packet.is_discard:
-                if packet.pts is None:
-                    untimed += 1
-                else:
-                    time_s = seconds(packet.pts, packet.time_base)
-                    if packet.is_keyframe and time_s < newest_key_s - HOLE_S:
-                        raise VideoError(
-                            f"{path}: timestamps start again at {time_s:.3f} s after {newest_key_s:.3f} s: recordings "
-                            "were joined as they were; give them one by one, or remux them into one timeline"
-                        )
-                    newest_key_s = max(newest_key_s, time_s) if packet.is_keyframe else newest_key_s
-                    times[time_s] = packet.is_keyframe
-        if is_cut_off(path):
-            broken = max(broken, stream.frames - len(times) - untimed)
-    if untimed > len(times):
-        raise VideoError(
-            f"{path}: {untimed} of {untimed + len(times)} packets carry no presentation time; remux it first: "
-            "ffmpeg -fflags +genpts -i IN -c copy OUT.mp4"
-        )
-    if not times:
-        raise VideoError(f"{path}: holds no whole frame ({broken} broken packets); get the file again")
-    ordered = sorted(times)
-    return PacketTimes(
-        times_s=np.array(ordered, dtype=np.float64),
-        is_keyframe=np.array([times[time] for time in ordered], dtype=bool),
-        broken_packets=broken,
-    )
 
 
 def source_frames(
