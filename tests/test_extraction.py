@@ -191,17 +191,39 @@ def test_a_source_of_fewer_frames_is_smoothed_over_the_same_time() -> None:
     )
 
 
+class ComesAndGoes(MovingCard):
+    """A card that is seen in some frames alone, and from one of them on surely."""
+
+    def __init__(self, seen: Sequence[int], *, sure_from: int = 0) -> None:
+        super().__init__(speed=0.5)
+        self.frames, self.sure_from = frozenset(seen), sure_from
+
+    def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
+        found = super().see(frame, number) if number in self.frames else []
+        return [replace(label, score=0.9 if number >= self.sure_from else 0.3) for label in found]
+
+
+def shown(scene: MovingCard, *, frames: int = 100) -> list[Keypoints]:
+    return label_with([scene], (scene.render(t) for t in range(frames)), first_frame=0, effort="exact")
+
+
 def test_ids_count_from_0_whatever_was_dropped() -> None:
-    """A blink before it leaves no gap in the numbers."""
+    """What was there for four frames leaves no gap in the numbers."""
+    labels = shown(ComesAndGoes([*range(10, 14), *range(70, 90)]))
+    assert [label.frame for label in labels] == list(range(70, 90))
+    assert {label.track_id for label in labels} == {0}
 
-    class Blinks(MovingCard):
-        def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
-            return super().see(frame, number) if number not in (12, 13, 14) else []
 
-    scene = Blinks(shown=range(999), cut=None)
-    frames = [scene.render(t) for t in range(60)]
-    labels = label_with([scene], frames, first_frame=0, effort="exact", breaks=frozenset({2, 4}))
-    assert sorted({label.track_id for label in labels}) == list(range(len({label.track_id for label in labels})))
+def test_who_is_there_at_a_runs_ends_need_not_last() -> None:
+    labels = shown(ComesAndGoes([*range(4), *range(48, 52), *range(96, 100)]))
+    assert [label.frame for label in labels] == [*range(4), *range(96, 100)]
+
+
+def test_what_becomes_sure_is_labelled_from_where_it_was_first_seen() -> None:
+    labels = shown(ComesAndGoes(range(20, 60), sure_from=40))
+    assert [label.frame for label in labels] == list(range(20, 60))
+    assert {label.track_id for label in labels} == {0}
+    assert shown(ComesAndGoes(range(20, 60), sure_from=60)) == []
 
 
 def test_fast_growth_brings_looks_closer() -> None:

@@ -220,6 +220,23 @@ def test_a_track_that_is_seen_takes_no_second_label() -> None:
     assert reach_back(looks(*frames), {0, 1}) == []
 
 
+def given(*frames: list[tuple[float, int]]) -> list[TrackedLook]:
+    """Looks at cars at (x, id)."""
+    return [
+        TrackedLook(frame=t, labels=tuple(replace(car(t, x), track_id=i) for x, i in seen), turn=np.eye(3))
+        for t, seen in enumerate(frames)
+    ]
+
+
+def test_a_name_is_given_once_in_a_look() -> None:
+    """A track that went from 600 to 100 px: what is free at 100 px while the track itself is at 600 is somebody else,
+    and before that only what is where the track came from can be it."""
+    later, earlier, first = [(100.0, 0)], [(100.0, UNTRACKED), (600.0, 0)], [(100.0, UNTRACKED), (600.0, UNTRACKED)]
+    found = reach_back(given(*[first] * 3, *[earlier] * 3, *[later] * 6), {0})
+    assert sorted(label.frame for label in found) == [0, 1, 2]
+    assert all(label.box_xyxy[0] > 500 for label in found)
+
+
 def test_reaching_back_follows_a_camera_that_turns() -> None:
     """90 px a frame: more than the object is wide."""
     shift = np.array([[1.0, 0, 90], [0, 1, 0], [0, 0, 1]])
