@@ -201,8 +201,8 @@ def _judge(variants: Sequence[VariantResult], *, seen: bool) -> tuple[Verdict, s
             f"the card's {own.name} sees {share:.0%} of what {' or '.join(good)} sees: change it",
         )
     return "unclear", (
-        f"{own.name} (the card) and {rivals[0].name} see about as much: give pictures of stronger colours, "
-        "or trust what the network's authors say"
+        f"{rivals[0].name} sees {rivals[0].evidence / own.evidence:.0%} of what {own.name} (the card) sees, which "
+        "decides nothing: give pictures of stronger colours, or trust what the network's authors say"
     )
 
 

@@ -10,8 +10,10 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from labeling.detection import Detector
 from labeling.errors import ConfigError, ModelError, VideoError
-from labeling.model_cards import find_weights, load_cards, weights_folders
+from labeling.extractors import STREET_PREFIX, choose_extractors
+from labeling.model_cards import SimccCard, find_weights, load_cards, weights_folders
 from labeling.model_check import check_card
 from labeling.video import decode_at, read_packet_times
 from pipelines.console import make_console
@@ -45,11 +47,35 @@ def read_images(paths: Sequence[Path]) -> list[np.ndarray]:
     return images
 
 
+def object_boxes(card: SimccCard, pictures: Sequence[np.ndarray], *, models_dir: Path | None) -> list[np.ndarray]:
+    """(n, 4) boxes of each picture in which a head's objects are: given a whole picture, it sees what is not there.
+
+    The job's own detector finds them; for the shipped street heads it is the street's.
+
+    Raises:
+        ConfigError: no detector's weights are there, or it finds nothing that the head is for.
+    """
+    names = ["street_detector"] if card.name.startswith(STREET_PREFIX) else None
+    own = choose_extractors(names, models_dir=models_dir).detector
+    weights = find_weights(own, models_dir) if own else None
+    if own is None or weights is None:
+        raise ConfigError(
+            f"{card.name} looks at boxes, and no detector's weights are there to find them; put a detector beside it"
+        )
+    detector = Detector(own, weights)
+    found = [detector.detect([picture])[0].of_category(card.category).boxes_xyxy for picture in pictures]
+    if not any(len(boxes) for boxes in found):
+        raise ConfigError(
+            f"{card.name} is for a {card.category}, and {own.name} finds none in the pictures; give others"
+        )
+    return found
+
+
 def print_check(name: str, images: Sequence[Path], *, models_dir: Path | None, as_json: bool = False) -> int:
     """Check one card and show every way it was tried; 1 where another way fits better.
 
     Raises:
-        ConfigError: no such card, or a picture that cannot be read.
+        ConfigError: no such card, a picture that cannot be read, or, for a head, no box to look at.
         ModelError: its weights are not there, or break the contract.
     """
     cards = load_cards(models_dir)
@@ -59,7 +85,13 @@ def print_check(name: str, images: Sequence[Path], *, models_dir: Path | None, a
     if path is None:
         folders = " or ".join(str(folder) for folder in weights_folders(models_dir))
         raise ModelError(f"{name}: no {cards[name].file} in {folders}; {cards[name].source}")
-    check = check_card(cards[name], path, read_images(images))
+    card, pictures = cards[name], read_images(images)
+    boxes = None
+    if isinstance(card, SimccCard) and pictures:
+        found = object_boxes(card, pictures, models_dir=models_dir)
+        shown = [n for n, one in enumerate(found) if len(one)]
+        pictures, boxes = [pictures[n] for n in shown], [found[n] for n in shown]
+    check = check_card(card, path, pictures, boxes_xyxy=boxes)
     if as_json:
         print(json.dumps(dataclasses.asdict(check), indent=1))
         return int(check.verdict == "another fits better")

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnx_fixtures
 import pytest
+from onnx_fixtures import random_simcc, simcc_card
+from pipeline_fixtures import write_detector
 from typer.testing import CliRunner
 
+from dataset.street import Street, StreetConfig
 from labeling.errors import ConfigError, ModelError
-from labeling.model_cards import SimccCard, write_card
+from labeling.model_cards import write_card
 from pipelines.cli import app
 from pipelines.model_check import read_images
 
@@ -20,11 +22,8 @@ RUNNER = CliRunner()
 @pytest.fixture
 def models(tmp_path: Path) -> Path:
     """A folder with one card and its weights, and a card whose weights are missing."""
-    values = {"schema": "coco17", "input_width": 64, "input_height": 96, "licence": "none", "source": "make it"}
-    for name in ("toy", "gone"):
-        card = SimccCard.model_validate({"name": name, "file": f"{name}.onnx", **values})
-        write_card(card, tmp_path / f"{name}.toml")
-    onnx_fixtures.random_simcc(tmp_path / "toy.onnx", points=17, width=64, height=96)
+    write_detector(tmp_path, name="toy")
+    write_card(simcc_card(name="gone", file="gone.onnx"), tmp_path / "gone.toml")
     cv2.imwrite(str(tmp_path / "noise.png"), np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8))
     return tmp_path
 
@@ -64,3 +63,22 @@ def test_a_video_gives_ten_frames_in_colour(real_data: Path) -> None:
     images = read_images([real_data / "solidWhiteRight.mp4"])
     assert len(images) == 10 and all(image.shape == (540, 960, 3) for image in images)
     assert not (images[0] == images[5]).all()
+
+
+@pytest.mark.parametrize("card", ["street_coco17", "street_car24"])
+def test_heads_that_are_right_are_not_condemned_on_whole_pictures(tmp_path: Path, card: str) -> None:
+    """Their objects are small in the picture: they are looked at in the boxes that the street's detector finds."""
+    frame = Street(StreetConfig(seed=2, scenario="traffic", frames=30)).render(5).rgb
+    cv2.imwrite(str(tmp_path / "street.png"), frame[:, :, ::-1])
+    result = RUNNER.invoke(app, ["models", "check", card, "--image", str(tmp_path / "street.png")])
+    assert result.exit_code == 0, result.output
+
+
+def test_a_head_without_a_box_to_look_at_says_so(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((64, 64, 3), np.uint8))
+    arguments = ["models", "check", "street_coco17", "--image", str(tmp_path / "black.png")]
+    assert "finds none in the pictures" in str(RUNNER.invoke(app, arguments).exception)
+    write_card(simcc_card(), tmp_path / "head.toml")
+    random_simcc(tmp_path / "head.onnx", points=17, width=64, height=96)
+    arguments = ["models", "check", "head", "--models", str(tmp_path), "--image", str(tmp_path / "black.png")]
+    assert "no detector's weights are there" in str(RUNNER.invoke(app, arguments).exception)
