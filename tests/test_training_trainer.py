@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 from pathlib import Path
 from typing import Any
@@ -309,6 +310,22 @@ def test_resume_refuses_other_settings_and_never_refuses_a_used_folder(tiny_job:
         run(tiny_config("motion", seed=5, optimiser={"learning_rate": 1e-3}), tiny_job, tmp_path)
     with pytest.raises(ConfigError, match="already has checkpoints"):
         run(config, tiny_job, tmp_path, resume="never")
+    assert run(config, tiny_job, tmp_path).losses == ()
+
+
+def test_resume_refuses_other_data(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    """A finished adapter of labels that have changed since is none of theirs."""
+    config = tiny_config("motion", checkpoint={"every_steps": 2})
+    run(config, tiny_job, tmp_path)
+    (log,) = (tiny_job / "latents").rglob("clips-*.jsonl")
+    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    changed = next(row for row in rows if row["split"] == "train") | {"source": "0" * 64, "turn": 9}
+    copy = tmp_path / "job"
+    shutil.copytree(tiny_job, copy)
+    with (copy / log.relative_to(tiny_job)).open("a") as file:
+        file.write(json.dumps(changed) + "\n")
+    with pytest.raises(ConfigError, match="trained on other clips, labels or captions"):
+        run(config, copy, tmp_path)
     assert run(config, tiny_job, tmp_path).losses == ()
 
 

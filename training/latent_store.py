@@ -127,6 +127,11 @@ class LatentStore:
         """Keys of a split, sorted."""
         return sorted(key for key, record in self._records.items() if record.split == split)
 
+    def data_digest(self, split: str) -> str:
+        """sha256 over what a training on a split learns from: its clips, what each was made from, and how."""
+        clips = [(key, self._records[key].source, self._records[key].caption) for key in self.keys(split)]
+        return hashlib.sha256(json.dumps([self.manifest.fingerprint, clips]).encode()).hexdigest()
+
     def record(self, key: str) -> ClipRecord:
         """The clip's record.
 

@@ -26,6 +26,8 @@ class RunState:
     step: int
     """Optimiser steps done."""
     config: dict[str, Any]
+    data: str = ""
+    """Digest of the clips that are learnt from (``LatentStore.data_digest``); empty where an older version wrote it."""
 
 
 def pack_state(
@@ -39,7 +41,7 @@ def pack_state(
         optimiser: over the parameters ``names``, in one group.
         names: of the parameters, in the optimiser's order.
         config: the run's.
-        state: the step.
+        state: the step, and the data.
         frames: video frames per clip that it was trained on.
         prefix: of the adapter's keys.
     """
@@ -47,7 +49,7 @@ def pack_state(
     return {
         ADAPTER: adapter_bytes(denoiser, config.stage, config.adapter, about=about, prefix=prefix),
         OPTIMISER: _moments(optimiser, names),
-        STATE: json.dumps({"step": state.step, "config": state.config}, sort_keys=True).encode(),
+        STATE: json.dumps({"step": state.step, "config": state.config, "data": state.data}, sort_keys=True).encode(),
     }  # fmt: skip
 
 
@@ -70,7 +72,7 @@ def read_state(checkpoint: Path) -> RunState:
     try:
         tree = json.loads((checkpoint / STATE).read_text(encoding="utf-8"))
         # Older checkpoints hold how far a loader got as well, which is not needed.
-        return RunState(step=tree["step"], config=tree["config"])
+        return RunState(step=tree["step"], config=tree["config"], data=tree.get("data", ""))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{checkpoint / STATE} is no run state ({error}); start afresh with --resume never") from error
 

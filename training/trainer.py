@@ -140,6 +140,11 @@ class Trainer:
                 f"{checkpoint} was trained with other settings ({', '.join(changed)}); restore them, or give "
                 "another --out"
             )
+        if state.data not in ("", self.store.data_digest("train")):
+            raise ConfigError(
+                f"{checkpoint} was trained on other clips, labels or captions than the latents hold now; give another "
+                "--out to train on these"
+            )
         restore(checkpoint, self.backbone.denoiser, self.optimiser, self.names, adapter=self.config.stage)
         return state.step
 
@@ -246,7 +251,9 @@ class Trainer:
     def _save(self) -> None:
         if not self.accelerator.is_main_process:
             return
-        state = RunState(step=self.step, config=self.config.model_dump(mode="json"))
+        state = RunState(
+            step=self.step, config=self.config.model_dump(mode="json"), data=self.store.data_digest("train")
+        )
         files = pack_state(
             self.backbone.denoiser, self.optimiser, self.names, config=self.config, state=state,
             frames=self.store.manifest.frames, prefix=self.backbone.adapter_prefix,
