@@ -74,7 +74,8 @@ class Rhythm:
 
     def __init__(self, settings: EffortSettings, *, flows: bool) -> None:
         self.settings, self.flows = settings, flows
-        self.gap = max(1, settings.max_gap // 2)
+        # What flow will carry is looked at again soon, to see whether it holds; lanes have nothing to try.
+        self.gap = max(1, settings.max_gap // 2) if flows else settings.max_lane_gap
         """Frames from the last look to the next."""
         self._last_seen: int | None = None
 

@@ -1,6 +1,6 @@
 """How often the networks look, and what is carried in between: on moving textures whose points are known."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,6 +137,22 @@ def test_an_empty_road_is_looked_at_twice_a_second() -> None:
     label_with([scene], (scene.render(t) for t in range(240)), first_frame=0, effort="balanced")
     late = [frame for frame in scene.seen if frame >= 48]
     assert len(late) <= (240 - 48) / 12 + 1
+
+
+class Lanes(MovingCard):
+    """The card as a lane line: flow carries nothing of it."""
+
+    carries = False
+    sure_scores: Mapping[str, float] = {"lane": 0.5}
+
+    def label(self, number: int) -> Keypoints:
+        return replace(super().label(number), category="lane", schema="lane24")
+
+
+def test_lanes_are_looked_at_twice_a_second_from_the_first_frame() -> None:
+    scene = Lanes(speed=0.2)
+    label_with([scene], (scene.render(t) for t in range(121)), first_frame=0, effort="balanced")
+    assert scene.seen == list(range(0, 121, 12))
 
 
 def test_what_passes_in_a_blink_is_no_object() -> None:
