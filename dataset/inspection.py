@@ -18,6 +18,7 @@ from dataset.selection import ClipRow, read_selection
 from dataset.shards import read_shard_index
 from labeling.errors import DataError
 from labeling.labels import Keypoints
+from labeling.object_video import MOST_TRACKS, tracks_of
 
 SHEET_ROWS = {"rgb.mp4": "RGB", "skeleton.mp4": "skeleton", "ego.mp4": "ego", "objects.mp4": "objects"}
 """The videos of a sheet from the top, and what they are called."""
@@ -201,11 +202,12 @@ def contact_sheet(sample: Sample, *, moments: int = _MOMENTS) -> np.ndarray:
         (_GUTTER + n * (_TILE[0] + _GAP) + centre, head + _TIMES - 8.0, f"{time:.2f} s", 9.0, _FAINT, "center")
         for n, time in enumerate(times)
     ]
-    texts += [
-        (_GUTTER - 10.0, head + _TIMES + n * (_TILE[1] + _GAP) + _TILE[1] / 2 + 4, SHEET_ROWS[suffix], 10.5, _FAINT,
-         "right")
-        for n, suffix in enumerate(suffixes)
-    ]  # fmt: skip
+    for n, suffix in enumerate(suffixes):
+        middle = head + _TIMES + n * (_TILE[1] + _GAP) + _TILE[1] / 2
+        texts.append((_GUTTER - 10.0, middle + 4, SHEET_ROWS[suffix], 10.5, _FAINT, "right"))
+        if suffix == "objects.mp4" and (tracks := len(tracks_of(sample.keypoints()))) > MOST_TRACKS:
+            # Rare traffic and a random choice of dense traffic look the same.
+            texts.append((_GUTTER - 10.0, middle + 20, f"{MOST_TRACKS} of {tracks}", 8.5, _FAINT, "right"))
     if "skeleton.mp4" in suffixes and not any(label.present.any() for label in sample.keypoints()):
         middle = head + _TIMES + (suffixes.index("skeleton.mp4") + 0.5) * (_TILE[1] + _GAP)
         note = "no keypoints: no keypoint network's weights were there, so there is nothing to draw"

@@ -39,8 +39,12 @@ def chosen_tracks(labels: Sequence[Keypoints], *, key: str, variant: int = 0, mo
 
     Ranks by a hash of (key, variant, track), so that a track added to the labels never reshuffles the others.
     """
-    tracks = {one.track_id for one in labels if one.category in _CATEGORIES and one.track_id != UNTRACKED}
-    return sorted(tracks, key=lambda track: (_rank(key, variant, track), track))[:most]
+    return sorted(tracks_of(labels), key=lambda track: (_rank(key, variant, track), track))[:most]
+
+
+def tracks_of(labels: Sequence[Keypoints]) -> set[int]:
+    """Ids of the cars and people that there are to choose from."""
+    return {one.track_id for one in labels if one.category in _CATEGORIES and one.track_id != UNTRACKED}
 
 
 def object_frames(

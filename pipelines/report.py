@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from dataset.inspection import SHEET_ROWS, Summary, contact_sheet, find_sample, summarize
 from dataset.loader import Sample, ShardDataset
@@ -251,7 +252,7 @@ def draw_objects(selection: Selection) -> np.ndarray:
     figure, axes = new_axes()
     counts = np.array([row.objects for row in selection.rows if row.objects is not None], dtype=float)
     if len(counts):
-        edges = np.linspace(0, max(1.0, float(counts.max())), min(30, 3 + 2 * len(np.unique(counts))))
+        edges = bin_edges(counts, at=selection.threshold or 0.0)
         kept = counts >= (selection.threshold or 0)
         axes.hist([counts[kept], counts[~kept]], bins=edges, stacked=True, color=[_ACCENT, _GREY],
                   label=["kept", "dropped"])  # fmt: skip
@@ -262,7 +263,19 @@ def draw_objects(selection: Selection) -> np.ndarray:
         axes.text(0.5, 0.5, "every clip is kept, so nothing was counted", ha="center", transform=axes.transAxes)
     axes.set_xlabel("objects per clip")
     axes.set_ylabel("clips")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True))
     return figure_pixels(figure)
+
+
+def bin_edges(counts: np.ndarray, *, at: float, most: int = 30) -> np.ndarray:
+    """Edges of a histogram of (N,) mean counts, halves or whole numbers apart, one of them at ``at``.
+
+    No bin then has both sides of a threshold in it.
+    """
+    step = max(0.5, np.ceil(2 * float(np.ptp(counts)) / most) / 2)
+    first, last = np.floor((counts.min() - at) / step), np.floor((counts.max() - at) / step) + 1
+    return at + step * np.arange(first, last + 1)
 
 
 def draw_trajectories(root: Path, *, most: int = 200) -> np.ndarray:

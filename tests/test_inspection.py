@@ -10,6 +10,7 @@ from dataset.shards import ShardPlan, write_shard, write_shard_index
 from dataset.tables import write_keypoints
 from labeling.encoding import VideoWriter
 from labeling.errors import DataError
+from pipelines.report import bin_edges
 
 FRAMES = 17
 
@@ -109,3 +110,19 @@ def test_a_spread_of_nothing_is_none():
     assert spread([]) is None
     found = spread([3, 1, 2])
     assert found and (found.least, found.median, found.total) == (1, 2, 6)
+
+
+def test_a_sheet_says_when_the_object_row_shows_a_few_of_many(job, monkeypatch):
+    sample = ShardDataset(job)[0]
+    plain = contact_sheet(sample)
+    for count, same in ((5, True), (6, False)):
+        monkeypatch.setattr("dataset.inspection.tracks_of", lambda _, count=count: set(range(count)))
+        assert np.array_equal(contact_sheet(sample), plain) == same
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 10.0, 17.5, 400.0])
+def test_no_bin_has_both_sides_of_the_threshold(threshold):
+    counts = np.concatenate([np.arange(0, 18.5, 0.5), [threshold]])
+    edges = bin_edges(counts, at=threshold)
+    assert threshold in edges and edges[0] <= counts.min() and edges[-1] > counts.max()
+    assert len(edges) <= 33 and (np.diff(edges) > 0).all()
