@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import onnx
+import onnx.utils
 
 from labeling.errors import ModelError
 from labeling.model_cards import ModelCard, file_sha256
@@ -116,6 +117,21 @@ def _check_external_tensor(tensor: onnx.TensorProto, folder: Path, path: Path) -
             f"which has {size}; copy the whole file"
         )
     return length
+
+
+def part_of_graph(path: Path, input_name: str, output_names: Sequence[str]) -> bytes:
+    """An ONNX file that ``check_file`` has passed, without what only its other outputs need.
+
+    Raises:
+        ModelError: the graph does not come apart.
+    """
+    try:
+        whole = onnx.load(str(path))
+        return onnx.utils.Extractor(whole).extract_model([input_name], list(output_names)).SerializeToString()
+    except Exception as error:  # onnx raises whatever its checker or protobuf do
+        raise ModelError(
+            f"{path}: {', '.join(output_names)} cannot be had alone: {first_line(error)}; export it again"
+        ) from error
 
 
 def _tensors(model: onnx.ModelProto) -> Iterator[onnx.TensorProto]:

@@ -11,7 +11,7 @@ import onnxruntime
 
 from labeling.errors import ModelError
 from labeling.model_cards import Dimensions, ModelCard
-from labeling.onnx_files import check_file, first_line, weights_sha256
+from labeling.onnx_files import check_file, first_line, part_of_graph, weights_sha256
 
 DEFAULT_PROVIDERS = ("CPUExecutionProvider",)
 PROVIDER_NAMES = {
@@ -61,11 +61,12 @@ class OnnxModel:
         self.path = path
         self.max_batch = max_batch
         check_file(card, path)
-        self._session = _open_session(path, resolve_providers(providers), threads)
-        self.providers: tuple[str, ...] = tuple(self._session.get_providers())
-        self._graph = _check_graph(self._session, card, path)
-        self._run_options = onnxruntime.RunOptions()
-        self._run_options.only_execute_path_to_fetches = True
+        self._open = functools.partial(_open_session, path, resolve_providers(providers), threads)
+        whole = self._open()
+        self.providers: tuple[str, ...] = tuple(whole.get_providers())
+        self._graph = _check_graph(whole, card, path)
+        self._sessions = {self._graph.output_names: whole}
+        """By the outputs that each computes."""
 
     @property
     def weights_sha256(self) -> str:
@@ -89,7 +90,8 @@ class OnnxModel:
                 f"{self.card.name} takes float32 (N, {wanted}), got {batch.dtype} {batch.shape}; resize first"
             )
         chosen = range(len(self._graph.output_names)) if outputs is None else outputs
-        parts = [self._run_chunk(chunk, [self._graph.output_names[i] for i in chosen]) for chunk in self._chunks(batch)]
+        names = tuple(self._graph.output_names[i] for i in chosen)
+        parts = [self._run_chunk(chunk, names) for chunk in self._chunks(batch)]
         if not parts:
             shapes = list(self.card.output_shapes().values())
             return [np.zeros((0, *(size or 0 for size in shapes[i][1:])), np.float32) for i in chosen]
@@ -100,12 +102,18 @@ class OnnxModel:
         for start in range(0, len(batch), size):
             yield batch[start : start + size]
 
-    def _run_chunk(self, chunk: np.ndarray, names: list[str]) -> list[np.ndarray]:
+    def _session(self, names: tuple[str, ...]) -> onnxruntime.InferenceSession:
+        """One that computes these outputs alone: a session asked for some of its outputs computes all of them."""
+        if names not in self._sessions:
+            self._sessions[names] = self._open(part=part_of_graph(self.path, self._graph.input_name, names))
+        return self._sessions[names]
+
+    def _run_chunk(self, chunk: np.ndarray, names: tuple[str, ...]) -> list[np.ndarray]:
         fixed, count = self._graph.batch, len(chunk)
         if fixed and count < fixed:
             chunk = np.concatenate([chunk, np.repeat(chunk[-1:], fixed - count, axis=0)])
         try:
-            results = self._session.run(names, {self._graph.input_name: chunk}, self._run_options)
+            results = self._session(names).run(names, {self._graph.input_name: chunk})
         except Exception as error:  # onnxruntime raises a dozen private types
             raise ModelError(
                 f"{self.card.name} failed on {chunk.shape}: {first_line(error)}; check {self.path}"
@@ -164,7 +172,10 @@ def _levels(mean: tuple[float, float, float], std: tuple[float, float, float]) -
     return values.astype(np.float32)
 
 
-def _open_session(path: Path, providers: list[str], threads: int) -> onnxruntime.InferenceSession:
+def _open_session(
+    path: Path, providers: list[str], threads: int, *, part: bytes | None = None
+) -> onnxruntime.InferenceSession:
+    """Of an ONNX file, or of a part of its graph."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
@@ -172,7 +183,7 @@ def _open_session(path: Path, providers: list[str], threads: int) -> onnxruntime
     # Spinning threads starve the other worker processes of a job.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
+        session = onnxruntime.InferenceSession(part or str(path), options, providers=providers)
     except Exception as error:  # onnxruntime raises a dozen private types
         raise ModelError(f"{path} cannot be opened: {first_line(error)}; download or export it again") from error
     if session.get_providers()[0] != providers[0]:

@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 import onnx_fixtures
 import pytest
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, numpy_helper
 from onnx_fixtures import simcc_card
 from pydantic import ValidationError
 
@@ -192,6 +192,21 @@ class TestSessions:
         path = onnx_fixtures.constant_model(tmp_path / "head.onnx", simcc_card(), outputs)
         with pytest.raises(ModelError, match="NaN or infinity in 'simcc_y'"):
             OnnxModel(simcc_card(), path).run(random_batch(1))
+
+    def test_outputs_that_are_not_asked_for_are_not_computed(self, head_path: Path) -> None:
+        whole = OnnxModel(simcc_card(), head_path)
+        batch = random_batch(3)
+        wanted = whole.run(batch)
+        np.testing.assert_array_equal(whole.run(batch, outputs=[1])[0], wanted[1])
+        broken = onnx.load(str(head_path))
+        along_y = next(node for node in broken.graph.node if list(node.output) == ["simcc_y"])
+        along_y.CopyFrom(helper.make_node("Reshape", ["rows", "impossible"], ["simcc_y"]))
+        broken.graph.initializer.append(numpy_helper.from_array(np.array([1, 17, 192]), "impossible"))
+        onnx.save(broken, str(head_path))
+        model = OnnxModel(simcc_card(), head_path)
+        with pytest.raises(ModelError, match="failed on"):
+            model.run(batch)
+        np.testing.assert_array_equal(model.run(batch, outputs=[0])[0], wanted[0])
 
     def test_a_batch_of_another_shape_or_type_is_refused(self, head_path: Path) -> None:
         model = OnnxModel(simcc_card(), head_path)
