@@ -12,6 +12,7 @@ from dataset.selection import read_selection
 from labeling.ego_import import FileClock
 from labeling.errors import ConfigError
 from labeling.extractors import Extractors
+from labeling.onnx_model import resolve_providers
 from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, with_effort
 from pipelines.console import ConsoleReporter, print_failures
 from pipelines.engine import Engine
@@ -205,12 +206,13 @@ def check_extractors(job: Job, reporter: ConsoleReporter) -> None:
 
     Raises:
         ConfigError: no detector, though clips are to be ranked by what they show.
-        ModelError: weights that break their card's contract.
+        ModelError: weights that break their card's contract, or a provider that is not there.
     """
     choice = job_extractors(job)
     detector = job.config.count.detector or choice.detector
     if detector is None and job.config.select.keep_share < 1:
         raise ConfigError(NO_DETECTOR)
+    resolve_providers(job.config.count.providers)
     settings = job.config.keypoints
     opened = Extractors(choice, models_dir=job.models_dir, providers=settings.providers, threads=settings.threads)
     used = ", ".join(card.name for card in opened.choice.cards) or "none"

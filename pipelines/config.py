@@ -65,6 +65,8 @@ class CountSettings(Settings):
     looks_per_clip: int = Field(default=2, ge=1)
     """Frames to look at in each clip; where keyframes are rarer, others are sought out."""
     threads: int = Field(default=1, ge=1)
+    providers: tuple[str, ...] = ("CPUExecutionProvider",)
+    """As those of ``keypoints``."""
 
 
 class SelectSettings(Settings):

@@ -26,7 +26,7 @@ from labeling.model_cards import find_weights, load_cards
 from labeling.onnx_files import weights_sha256
 from labeling.timeline import ClipPlan, ClipSettings, Timeline, plan_clips, plan_timeline
 from labeling.video import decode_at
-from pipelines.config import PictureSettings, SelectSettings, parse_settings
+from pipelines.config import CountSettings, PictureSettings, SelectSettings, parse_settings
 from pipelines.job import Job
 from pipelines.layout import SELECTION, counts_path, index_path
 from pipelines.stage import NotReadyError, WorkItem
@@ -129,9 +129,10 @@ class CountStage:
         path = find_weights(card, folder)
         if path is None or card.kind != "yolox":
             raise ConfigError(f"{name}: is no detector whose weights are there; `animatic models` lists what is")
-        key = f"{path} {item.models} {item.settings['count']['threads']}"
+        key = f"{path} {item.models} {item.settings['count']}"
         if self._detector is None or self._detector[0] != key:
-            self._detector = (key, Detector(card, path, threads=item.settings["count"]["threads"]))
+            settings = CountSettings.model_validate(item.settings["count"])
+            self._detector = (key, Detector(card, path, providers=settings.providers, threads=settings.threads))
         return self._detector[1]
 
 

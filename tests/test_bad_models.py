@@ -55,7 +55,7 @@ def rows(count=0):
 
 def the_job(root, video, models, **changes):
     sources = {source.video_id: source for source in find_videos([video])}
-    config = small_config(select={"keep_share": 1.0}, **changes)
+    config = small_config(**{"select": {"keep_share": 1.0}, **changes})
     return Job(root, config, sources, models_dir=models)
 
 
@@ -206,9 +206,14 @@ def test_a_graph_of_dynamic_axes_that_fits_is_used(tmp_path, video):
 
 def test_a_provider_that_is_not_there_is_said_and_never_replaced(tmp_path, video):
     models = write_detector(tmp_path / "m")
-    wanted = options(tmp_path, models, config={"keypoints": {"providers": ["cuda"]}})
-    with pytest.raises(ModelError, match="CUDAExecutionProvider is not there"):
-        run_label([video], tmp_path / "J", wanted)
+    for part in ("keypoints", "count"):
+        wanted = options(tmp_path, models, config={part: {"providers": ["cuda"]}})
+        with pytest.raises(ModelError, match="CUDAExecutionProvider is not there"):
+            run_label([video], tmp_path / "J", wanted)
+    job = the_job(tmp_path / "C", video, models, count={"providers": ["cuda"]}, select={"keep_share": 0.5})
+    run_all(job, stages=("source", "index", "count"))
+    (receipt,) = read_receipts(job.root, "count").values()
+    assert (receipt.state, receipt.reason) == ("failed", "model") and "is not there" in receipt.message
     job = the_job(tmp_path / "K", video, models, keypoints={"providers": ["cuda"]})
     run_all(job, stages=LABELLED)
     (receipt,) = read_receipts(job.root, "keypoints").values()
