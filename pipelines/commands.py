@@ -17,9 +17,10 @@ from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, w
 from pipelines.console import ConsoleReporter, print_failures
 from pipelines.engine import Engine
 from pipelines.imports import import_trajectories
-from pipelines.job import Job, absolute, find_videos, open_job, open_or_create
+from pipelines.job import Job, open_job, open_or_create
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
 from pipelines.layout import SELECTION
+from pipelines.sources import absolute, find_videos
 from pipelines.stage import COMMAND_STAGES, Part, parse_part
 from pipelines.stages_select import NO_DETECTOR, job_extractors, refuse_extend
 

@@ -18,8 +18,9 @@ from labeling.video import probe
 from pipelines.commands import JobOptions, configured
 from pipelines.config import Config
 from pipelines.engine import Engine
-from pipelines.job import Job, Source, find_videos, with_leave_out
+from pipelines.job import Job
 from pipelines.label import ALL_STAGES, Reporter, StageReport, run_stages
+from pipelines.sources import Source, find_videos, with_leave_out
 from pipelines.stage import Part
 
 CALIBRATION_S = 60.0

@@ -28,8 +28,9 @@ from labeling.labels import Keypoints
 from labeling.timeline import Span
 from labeling.video import read_frames
 from pipelines.config import CameraSettings, EgoStageSettings, PictureSettings, video_camera
-from pipelines.job import ImportedTrajectory, Job
+from pipelines.job import Job
 from pipelines.layout import camera_path, index_path, parse_run_item, run_path
+from pipelines.sources import ImportedTrajectory
 from pipelines.stage import WorkItem
 from pipelines.stages_labels import run_breaks
 from pipelines.stages_source import picture_map

@@ -14,8 +14,9 @@ from labeling.errors import VideoError
 from labeling.timeline import Span, cut_run, plan_runs, plan_timeline
 from labeling.video import frame_count, probe, read_packet_times
 from pipelines.config import PictureSettings
-from pipelines.job import Job, Source
+from pipelines.job import Job
 from pipelines.layout import SELECTION, index_path, run_item, run_path
+from pipelines.sources import Source
 from pipelines.stage import NotReadyError, WorkItem
 
 

@@ -17,10 +17,11 @@ from labeling.model_cards import SimccCard, YoloxCard, file_sha256, write_card
 from labeling.timeline import Span
 from pipelines.commands import JobOptions, run_label
 from pipelines.console import ConsoleReporter
-from pipelines.job import Job, find_videos
+from pipelines.job import Job
 from pipelines.label import StageReport
 from pipelines.layout import run_path
 from pipelines.models import print_models
+from pipelines.sources import find_videos
 
 SIZE = 256
 LABELLED = ("source", "index", "count", "select", "cut", "keypoints")

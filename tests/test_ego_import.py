@@ -17,7 +17,8 @@ from labeling.ego_motion import RoadView
 from labeling.errors import ConfigError, TrajectoryError
 from pipelines.cli import main
 from pipelines.imports import import_trajectories, match_files
-from pipelines.job import Job, Source, open_job, open_or_create
+from pipelines.job import Job, open_job, open_or_create
+from pipelines.sources import Source
 from pipelines.stage import STAGES
 from pipelines.status import job_status
 

@@ -27,7 +27,8 @@ from pipelines.evaluate import EvaluateOptions, Evaluation, evaluate
 from pipelines.evaluate_console import coverage_table, figure_table
 from pipelines.evaluate_notes import clip_notes, record_notes, ruler_notes
 from pipelines.generate_clips import ClipsRequest, chosen_clips, generate_clips
-from pipelines.job import Job, Source
+from pipelines.job import Job
+from pipelines.sources import Source
 from training.evaluation_estimates import LEAST_CONFIDENCE, clip_truth, ego_fault
 from training.evaluation_files import SampleFolder, find_samples, sample_name, shown_frames, video_rate
 from training.evaluation_report import FLOOR, HELD, SAMPLES, TRUE_SKELETONS, VELOCITY

@@ -14,8 +14,9 @@ from labeling.errors import ConfigError, DataError
 from labeling.schemas import keypoint_schema
 from labeling.timeline import Span
 from pipelines.export_coco import COCO_IDS, CocoRun, coco_annotation, coco_category, coco_chunks, export_coco
-from pipelines.job import Job, find_videos
+from pipelines.job import Job
 from pipelines.layout import run_path
+from pipelines.sources import find_videos
 
 
 def a_run(number, *, start=0, frames=(), first_image=1):

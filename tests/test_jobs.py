@@ -12,7 +12,8 @@ from dataset.selection import read_selection
 from labeling.errors import ConfigError
 from pipelines.commands import JobOptions, prepare_job, run_select
 from pipelines.config import merged
-from pipelines.job import Job, Source, open_job
+from pipelines.job import Job, open_job
+from pipelines.sources import Source
 from pipelines.stage import NotReadyError
 
 UP_TO_COUNT = ("source", "index", "count")

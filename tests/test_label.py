@@ -17,8 +17,9 @@ from labeling.camera import check_poses
 from labeling.errors import ConfigError
 from labeling.model_cards import load_cards, write_card
 from labeling.timeline import clip_key
-from pipelines.job import Job, Source, find_videos, open_job, open_or_create
+from pipelines.job import Job, open_job, open_or_create
 from pipelines.label import sweep_outdated
+from pipelines.sources import Source, find_videos
 from pipelines.stage import NotReadyError, Part, parse_part
 
 KEEP_ALL = {"select": {"keep_share": 1.0}}

@@ -13,9 +13,10 @@ from labeling.ego_calibration import ROAD_FRAMES
 from labeling.errors import ConfigError
 from labeling.timeline import ClipSettings
 from pipelines.commands import JobOptions
-from pipelines.job import Job, Source, find_videos
+from pipelines.job import Job
 from pipelines.plan import _Measured, _scaled, count_candidates, plan_job, plan_windows
 from pipelines.plan_console import hours, show_plan, size
+from pipelines.sources import Source, find_videos
 
 
 @pytest.fixture(scope="module")

@@ -20,8 +20,9 @@ from dataset import receipts
 from dataset.receipts import ReceiptLog, read_receipts
 from labeling.errors import StorageError
 from pipelines import engine, items
-from pipelines.job import Job, find_videos
+from pipelines.job import Job
 from pipelines.label import StageReport, run_stages
+from pipelines.sources import find_videos
 from pipelines.stage import STAGES, NotReadyError
 
 MOMENTS = ("outputs made, none published", "outputs published, no receipt", "receipt torn")

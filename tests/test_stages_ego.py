@@ -24,7 +24,8 @@ from labeling.errors import ConfigError, DataError, TrajectoryError
 from labeling.video import probe
 from pipelines.commands import read_cameras
 from pipelines.config import CameraSettings, Config, parse_config, video_camera
-from pipelines.job import Job, Source
+from pipelines.job import Job
+from pipelines.sources import Source
 from pipelines.stage import WorkItem
 from pipelines.stages_ego import CameraStage, source_intrinsics
 

@@ -1,0 +1,212 @@
+"""The source videos of a job: how a person names them, and how ``job.yaml`` keeps them."""
+
+import csv
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from labeling.errors import ConfigError
+from labeling.timeline import LONGEST_VIDEO_ID, check_video_id
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v", ".ts", ".mts", ".mpg", ".mpeg", ".flv"})
+_LIST_SUFFIXES = frozenset({".txt", ".lst", ".list", ".tsv"})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImportedTrajectory:
+    """A video's trajectory from elsewhere, as copied into the job."""
+
+    file: str
+    """Relative to the job's folder."""
+    sha256: str
+    offset_s: float = 0.0
+    """The file's time at the video's first frame."""
+    fps: float | None = None
+    """Rows a second, of a file without times; None: a row for each frame of the source."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """One source video of a job."""
+
+    video_id: str
+    path: Path
+    leave_out_s: tuple[float, float] = (0.0, 0.0)
+    """Seconds at its start and at its end that no clip may touch (intro, credits)."""
+    trajectory: ImportedTrajectory | None = None
+    """Instead of an estimated one."""
+
+
+def read_source(job_file: Path, video_id: Any, entry: Any) -> Source:
+    """A source as ``job.yaml`` keeps it.
+
+    Raises:
+        ConfigError: an id, a path or a length that cannot be.
+    """
+    try:
+        check_video_id(video_id)
+        leave_out_s = _pair(entry.get("leave_out_s", (0, 0)))
+        if not _are_lengths(leave_out_s):
+            raise ValueError(f"leave_out_s holds {leave_out_s}, no two lengths of time")
+        trajectory = ImportedTrajectory(**entry["trajectory"]) if "trajectory" in entry else None
+        return Source(video_id=video_id, path=Path(entry["path"]), leave_out_s=leave_out_s, trajectory=trajectory)
+    except Exception as error:
+        raise ConfigError(
+            f"{job_file}: videos: {video_id!r} cannot be {entry!r} ({error}); give it a path and, if wanted, "
+            "leave_out_s: [START, END]"
+        ) from error
+
+
+def source_values(source: Source) -> dict[str, Any]:
+    """As ``job.yaml`` keeps a source."""
+    values: dict[str, Any] = {"path": str(source.path)}
+    if any(source.leave_out_s):
+        values["leave_out_s"] = list(source.leave_out_s)
+    if source.trajectory is not None:
+        values["trajectory"] = {name: value for name, value in asdict(source.trajectory).items() if value is not None}
+    return values
+
+
+def find_videos(arguments: Sequence[Path], *, out: Path | None = None) -> list[Source]:
+    """The source videos that a person named: files, folders (searched to their depths), text files of paths.
+
+    A line of a text file is a path, relative to that file, with an id before it if wanted: ``id<TAB>path``. What a job
+    made is no source: below a folder, ``out`` and every folder that holds a ``job.yaml`` are left out.
+
+    Raises:
+        ConfigError: nothing there, an id that cannot be used, two videos with one id, or none of them exists.
+    """
+    found = [entry for argument in arguments for entry in _expand(argument, out)]
+    sources: dict[str, Source] = {}
+    for video_id, path in found:
+        _check_id(video_id, path)
+        old = sources.get(video_id)
+        if old is not None and old.path != path:
+            raise ConfigError(same_id(video_id, old.path, path))
+        sources[video_id] = Source(video_id=video_id, path=path)
+    if sources and not any(source.path.exists() for source in sources.values()):
+        missing = next(iter(sources.values())).path
+        raise ConfigError(f"{missing}: no such file; check the path")
+    return list(sources.values())
+
+
+def with_leave_out(sources: Mapping[str, Source], table: Path) -> dict[str, Source]:
+    """Sources with what a table (see ``read_leave_out``) leaves out of those that it names; the others as they are.
+
+    Raises:
+        ConfigError: the table cannot be used, or names a video that is none of them.
+    """
+    spans = read_leave_out(table)
+    unknown = sorted(set(spans) - set(sources))
+    if unknown:
+        raise ConfigError(f"{table}: names {unknown[0]!r}, which is none of the videos; use ids, as {_some(sources)}")
+    named = {video_id: replace(sources[video_id], leave_out_s=span) for video_id, span in spans.items()}
+    return {**sources, **named}
+
+
+def same_id(video_id: str, first: Path, second: Path) -> str:
+    """What is said of two files with one id."""
+    return (
+        f"two videos would be called {video_id!r}: {first} and {second}; rename one, or give a text file of lines "
+        "`id<TAB>path` in their place"
+    )
+
+
+def absolute(path: Path) -> Path:
+    """A path from the root, without ``..``, so that a file has one name by every route; links keep theirs."""
+    return Path(os.path.normpath(path.absolute()))
+
+
+def _check_id(video_id: str, path: Path) -> None:
+    """Raise ``ConfigError`` unless a video's id can be part of a clip's key."""
+    try:
+        check_video_id(video_id)
+    except Exception as error:
+        raise ConfigError(
+            f"{path}: {video_id!r} is no video id (at most {LONGEST_VIDEO_ID} letters, digits, - and _); rename the "
+            "file, or give a text file of lines `id<TAB>path` in its place"
+        ) from error
+
+
+def read_leave_out(path: Path) -> dict[str, tuple[float, float]]:
+    """Seconds to leave out at each video's start and end: a CSV table with the columns ``video_id, start_s, end_s``.
+
+    Raises:
+        ConfigError: it cannot be read, lacks a column, names a video twice, or holds something that is no length.
+    """
+    spans: dict[str, tuple[float, float]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            for number, row in enumerate(csv.DictReader(stream), start=2):
+                span = _pair((row["start_s"] or 0, row["end_s"] or 0))
+                if not _are_lengths(span) or row["video_id"] in spans:
+                    raise ValueError(f"line {number} repeats a video or is no length of time")
+                spans[row["video_id"]] = span
+    except KeyError as error:
+        raise ConfigError(f"{path}: has no column {error}; give video_id,start_s,end_s") from error
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        raise ConfigError(f"{path}: cannot be read as video_id,start_s,end_s ({error}); mend the table") from error
+    return spans
+
+
+def _pair(values: Sequence[Any]) -> tuple[float, float]:
+    start, end = values
+    return float(start), float(end)
+
+
+def _are_lengths(values: Sequence[float]) -> bool:
+    return all(0 <= value < math.inf for value in values)
+
+
+def _expand(argument: Path, out: Path | None) -> list[tuple[str, Path]]:
+    if argument.is_dir():
+        if _is_job(argument, out):
+            raise ConfigError(
+                f"{argument}: is a job's own folder; give the folder of the videos, and --out another one (a job that "
+                "is there goes on without any VIDEO)"
+            )
+        files = sorted(_files_below(argument, out))
+        if not files:
+            raise ConfigError(f"{argument}: holds no videos ({', '.join(sorted(VIDEO_SUFFIXES))}); check the path")
+        return [(path.stem, absolute(path)) for path in files]
+    if argument.suffix.lower() in _LIST_SUFFIXES and argument.is_file():
+        return _read_list(argument)
+    return [(argument.stem, absolute(argument))]
+
+
+def _files_below(folder: Path, out: Path | None) -> Iterator[Path]:
+    """Every video file below a folder, but those of jobs."""
+    for place, folders, names in os.walk(folder):
+        here = Path(place)
+        folders[:] = [name for name in folders if not _is_job(here / name, out)]
+        files = (here / name for name in names)
+        yield from (path for path in files if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file())
+
+
+def _is_job(folder: Path, out: Path | None) -> bool:
+    """Whether a folder is a job's, or about to be."""
+    return (folder / "job.yaml").is_file() or (out is not None and folder.resolve() == out.resolve())
+
+
+def _read_list(path: Path) -> list[tuple[str, Path]]:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as a list of videos ({error}); give a path on each line") from error
+    entries = []
+    for line in lines:
+        video_id, tab, name = line.strip().rpartition("\t")
+        if not name.strip() or line.lstrip().startswith("#"):
+            continue
+        video = absolute(path.parent / name.strip())
+        entries.append((video_id.strip() if tab else video.stem, video))
+    if not entries:
+        raise ConfigError(f"{path}: lists no videos; give a path on each line")
+    return entries
+
+
+def _some(sources: Mapping[str, Source]) -> str:
+    return ", ".join(repr(name) for name in list(sources)[:3])
