@@ -48,11 +48,18 @@ def match_files(path: Path, video_ids: tuple[str, ...]) -> Mapping[str, Path]:
     has a single video.
 
     Raises:
-        ConfigError: none belongs to one.
+        ConfigError: none belongs to one, or two belong to the same.
     """
     if path.is_dir():
-        found = {file.stem: file for file in sorted(path.iterdir()) if file.suffix.lower() in SUFFIXES}
-        matched = {name: file for name, file in found.items() if name in video_ids}
+        matched: dict[str, Path] = {}
+        for file in sorted(path.iterdir()):
+            if file.suffix.lower() not in SUFFIXES or file.stem not in video_ids:
+                continue
+            if file.stem in matched:
+                raise ConfigError(
+                    f"{path}: holds two trajectories of {file.stem}, {matched[file.stem].name} and {file.name}; keep one"
+                )
+            matched[file.stem] = file
         if not matched:
             raise ConfigError(
                 f"{path}: holds no trajectory of a video of this job; call the files <video_id>.tum or .txt, as "

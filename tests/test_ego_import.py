@@ -161,6 +161,10 @@ def test_files_belong_to_videos_by_their_names(tmp_path):
         match_files(tmp_path, ("x", "y"))
     with pytest.raises(ConfigError, match="no such file"):
         match_files(tmp_path / "gone.tum", ("a",))
+    (tmp_path / "a.txt").write_text("")
+    with pytest.raises(ConfigError, match=r"two trajectories of a, a\.tum and a\.txt"):
+        match_files(tmp_path, ("a", "b"))
+    assert match_files(tmp_path, ("b",)) == {"b": tmp_path / "b.txt"}
 
 
 @pytest.fixture(scope="module")
