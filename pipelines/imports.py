@@ -56,9 +56,8 @@ def match_files(path: Path, video_ids: tuple[str, ...]) -> Mapping[str, Path]:
             if file.suffix.lower() not in SUFFIXES or file.stem not in video_ids:
                 continue
             if file.stem in matched:
-                raise ConfigError(
-                    f"{path}: holds two trajectories of {file.stem}, {matched[file.stem].name} and {file.name}; keep one"
-                )
+                both = f"{matched[file.stem].name} and {file.name}"
+                raise ConfigError(f"{path}: holds two trajectories of {file.stem}, {both}; keep one")
             matched[file.stem] = file
         if not matched:
             raise ConfigError(
