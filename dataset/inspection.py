@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from dataset.loader import Sample, ShardDataset
 from dataset.receipts import Receipt, read_receipts, reason_counts
-from dataset.selection import ClipRow, read_selection
+from dataset.selection import ClipRow, Selection, read_selection
 from dataset.shards import read_shard_index
 from labeling.errors import DataError
 from labeling.labels import Keypoints
@@ -98,21 +98,34 @@ def summarize(job: Path) -> Summary:
     splits = {row.key: row.split for row in rows}
     kept = {row.key for row in selection.kept}
     rendered = [r for key, r in receipts["render"].items() if r.state == "done" and key in kept]
-    dropped = [row.reason or "" for row in selection.rows if not row.kept]
-    dropped += [r.reason for key, r in receipts["render"].items() if r.state == "dropped" and key in kept]
     return Summary(
         videos=sum(r.state == "done" for r in receipts["index"].values()),
         source_hours=sum(r.facts.get("seconds", 0.0) for r in receipts["index"].values()) / 3600,
         clip_hours=sum(lengths.get(key, 0) for key in splits) / _FPS / 3600,
         clips=len(selection.rows), kept=len(selection.kept),
         packed={split: _count(splits, split) for split in ("train", "val")},
-        dropped=reason_counts(dropped), threshold=selection.threshold,
+        dropped=reason_counts(_drop_reasons(selection, receipts["render"]).values()), threshold=selection.threshold,
         objects_per_clip=spread([row.objects for row in selection.rows if row.objects is not None]),
         tracks_per_clip=spread([r.facts["objects"] for r in rendered]),
         path_length_m=spread([r.facts["metres"] for r in rendered]),
         bytes_by_kind=_bytes_by_kind(rows),
         failed={stage: count for stage, found in receipts.items() if (count := _failures(found))},
     )  # fmt: skip
+
+
+def drop_reasons(job: Path) -> dict[str, str]:
+    """By key: why each clip is dropped, by the selection or when it was to be drawn.
+
+    Raises:
+        DataError: the folder holds no selection.
+    """
+    return _drop_reasons(read_selection(job / "selection.parquet"), read_receipts(job, "render"))
+
+
+def _drop_reasons(selection: Selection, rendered: Mapping[str, Receipt]) -> dict[str, str]:
+    late = {key: receipt.reason for key, receipt in rendered.items() if receipt.state == "dropped"}
+    reasons = {row.key: late.get(row.key) if row.kept else row.reason or "" for row in selection.rows}
+    return {key: reason for key, reason in reasons.items() if reason is not None}
 
 
 def _count(splits: Mapping[str, str], split: str) -> int:

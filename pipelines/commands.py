@@ -2,10 +2,12 @@
 
 import csv
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from rich.markup import escape
 
 from dataset.receipts import Receipt, storage_errors
 from dataset.selection import read_selection
@@ -20,6 +22,7 @@ from pipelines.imports import import_trajectories
 from pipelines.job import Job, open_job, open_or_create
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
 from pipelines.layout import SELECTION
+from pipelines.nothing_left import clips_packed, why_nothing_is_left
 from pipelines.sources import absolute, find_videos
 from pipelines.stage import COMMAND_STAGES, Part, parse_part
 from pipelines.stages_select import NO_DETECTOR, job_extractors, refuse_extend
@@ -45,7 +48,7 @@ class JobOptions:
 
 
 def run_label(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
-    """The main job; 0, or 1 where something failed.
+    """The main job; 0, or 1 where something failed or no clip is left.
 
     Raises:
         AnimaticError: something a person can mend before anything is spent.
@@ -236,13 +239,17 @@ def run_job(job: Job, stages: Sequence[str], options: JobOptions, reporter: Cons
 def _finish(job: Job, reports: Sequence[StageReport], reporter: ConsoleReporter) -> int:
     failed: list[Receipt] = [receipt for report in reports for receipt in report.failed]
     print_failures(failed, reporter.console)
-    selected = any(report.stage == "select" for report in reports)
-    if selected and (job.root / SELECTION).is_file():
-        selection = read_selection(job.root / SELECTION)
-        if not selection.kept:
-            reasons = sorted({row.reason for row in selection.rows if row.reason})
-            reporter.console.print(f"[red]no clip is left:[/] {'; '.join(reasons[:3]) or 'no video could be read'}")
-            return 1
-    if any(report.stage == "shards" for report in reports) and not failed:
+    stages = {report.stage for report in reports}
+    if _is_empty(job, stages):
+        reporter.console.print(f"[red]{escape(why_nothing_is_left(job.root))}[/]")
+        return 1
+    if "shards" in stages and not failed:
         reporter.console.print(f"{'':>10} look at it with `animatic inspect {job.root}`")
     return 1 if failed else 0
+
+
+def _is_empty(job: Job, stages: Collection[str]) -> bool:
+    """Whether stages that were run have left no clip: none is packed, or none selected."""
+    if "select" in stages and (job.root / SELECTION).is_file() and not read_selection(job.root / SELECTION).kept:
+        return True
+    return "shards" in stages and clips_packed(job) == 0

@@ -16,7 +16,8 @@ from dataset.selection import read_selection
 from labeling.errors import AnimaticError, ConfigError, DataError
 from pipelines.console import file_size, make_console
 from pipelines.job import Job, open_job
-from pipelines.layout import SELECTION
+from pipelines.layout import SELECTION, SHARD_INDEX
+from pipelines.nothing_left import clips_packed, why_nothing_is_left
 from pipelines.stage import COMMAND_STAGES, NotReadyError, item_state
 
 
@@ -48,6 +49,8 @@ class JobStatus:
     stages: tuple[StageStatus, ...]
     clips: Mapping[str, int]
     """Clips kept and dropped by the selection, by reason."""
+    nothing_left: str
+    """Why a job that is through holds no clip; empty where it holds some, and before."""
     next_command: str
     next_reason: str
 
@@ -60,10 +63,11 @@ def job_status(root: Path) -> JobStatus:
     """
     job = open_job(root)
     stages = tuple(stage_status(job, name) for names in COMMAND_STAGES.values() for name in names)
-    command, reason = _next(root, stages)
+    empty = why_nothing_is_left(root) if _is_through(stages) and clips_packed(job) == 0 else ""
+    command, reason = _next(root, stages, empty=bool(empty))
     return JobStatus(
-        root=str(root), videos=len(job.sources), stages=stages, clips=_selected(root), next_command=command,
-        next_reason=reason,
+        root=str(root), videos=len(job.sources), stages=stages, clips=_selected(root),
+        nothing_left=empty, next_command=command, next_reason=reason,
     )  # fmt: skip
 
 
@@ -97,7 +101,11 @@ def _selected(root: Path) -> dict[str, int]:
     return {"kept": sum(row.kept for row in rows), **dropped}
 
 
-def _next(root: Path, stages: tuple[StageStatus, ...]) -> tuple[str, str]:
+def _is_through(stages: tuple[StageStatus, ...]) -> bool:
+    return not any(stage.items is None or stage.pending or stage.retryable for stage in stages)
+
+
+def _next(root: Path, stages: tuple[StageStatus, ...], *, empty: bool) -> tuple[str, str]:
     """What to type next, and why."""
     again = f"animatic label --out {root}"
     for stage in stages:
@@ -107,15 +115,17 @@ def _next(root: Path, stages: tuple[StageStatus, ...]) -> tuple[str, str]:
         if stage.items is None or stage.pending:
             left = f"{stage.pending} of {stage.stage} are to be made" if stage.pending else stage.waits_for
             return again, left
-    if stages[-1].done and (root / "shards" / "index.parquet").is_file():
+    if empty:
+        return again, "with other settings or videos: no clip is left"
+    if stages[-1].done and (root / SHARD_INDEX).is_file():
         return f"animatic inspect {root}", "everything is packed"
     return again, "nothing is packed yet"
 
 
 def print_status(root: Path, *, as_json: bool = False) -> int:
-    """Print a job's status; 1 where something failed."""
+    """Print a job's status; 1 where something failed or no clip is left."""
     status = job_status(root)
-    failed = any(stage.failed or stage.retryable for stage in status.stages)
+    failed = bool(status.nothing_left) or any(stage.failed or stage.retryable for stage in status.stages)
     console = make_console()
     if as_json:
         print(json.dumps(asdict(status), indent=1))
@@ -145,6 +155,8 @@ def print_status(root: Path, *, as_json: bool = False) -> int:
         console.print("clips: " + ", ".join(f"{count} {name}" for name, count in status.clips.items()))
     for line in failure_lines(root):
         console.print(f"[red]{escape(line)}[/]")
+    if status.nothing_left:
+        console.print(f"[red]{escape(status.nothing_left)}[/]")
     console.print(f"next: [bold]{status.next_command}[/]  [dim]({escape(status.next_reason)})[/]")
     return int(failed)
 
@@ -214,10 +226,11 @@ def _print_summary(root: Path, summary: Summary) -> None:
     table = Table(title=str(root), title_justify="left", show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
-    threshold = f"at least {summary.threshold:.3g} objects" if summary.threshold is not None else "every clip"
+    rule = f"at least {summary.threshold:.3g} objects" if summary.threshold is not None else "every clip"
+    kept = f"kept {summary.kept} ({rule})" if summary.kept else "none kept"
     rows = {
         "source": f"{summary.videos} videos, {summary.source_hours:.3g} h",
-        "clips": f"{summary.clips}, kept {summary.kept} ({threshold}), packed {sum(summary.packed.values())} "
+        "clips": f"{summary.clips}, {kept}, packed {sum(summary.packed.values())} "
         f"({', '.join(f'{count} {split}' for split, count in summary.packed.items())}), {summary.clip_hours:.3g} h",
         "dropped": ", ".join(f"{count} {reason}" for reason, count in summary.dropped.items()) or "none",
         "objects per clip": _spread_text(summary.objects_per_clip, "counted"),
@@ -229,8 +242,10 @@ def _print_summary(root: Path, summary: Summary) -> None:
     for name, text in rows.items():
         table.add_row(name, escape(text))
     console.print(table)
-    if summary.packed:
+    if sum(summary.packed.values()):
         console.print(f"one clip: [bold]animatic inspect {root} {_some_key(root)} --sheet sheet.png[/]")
+    elif not summary.kept or (root / SHARD_INDEX).is_file():
+        console.print(f"[red]{escape(why_nothing_is_left(root))}[/]")
 
 
 def _spread_text(found: Spread | None, unit: str) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 
@@ -190,7 +191,25 @@ def test_a_job_of_which_nothing_is_left_says_why(run, config, tmp_path):
     code, out, _ = run(
         "label", short, "--out", tmp_path / "J", "--config", config, "--keep-share", "1", "--workers", "0"
     )
-    assert code == 1 and "no clip is left: too_short: frames=5 < clip_frames=9" in out
+    why = "no clip is left of 1: 1 too_short (short_0: too_short: frames=5 < clip_frames=9); give longer videos"
+    assert code == 1 and why in out
+    code, out, _ = run("status", tmp_path / "J")
+    assert code == 1 and why in out and "everything is packed" not in out
+    assert json.loads(run("status", tmp_path / "J", "--json")[1])["nothing_left"].startswith(why)
+    code, out, _ = run("inspect", tmp_path / "J")
+    assert code == 0 and why in out and "none kept" in out and "--sheet" not in out
+
+
+def test_a_job_whose_kept_clips_are_all_dropped_later_says_why(run, job, tmp_path):
+    root = shutil.copytree(job, tmp_path / "J")
+    trajectory = tmp_path / "street.tum"
+    trajectory.write_text("0 0 0 0 0 0 0 1\n0.1 0 0 1 0 0 0 1\n")
+    assert run("ego", root, "--import", trajectory, "--workers", "0")[0] == 0
+    why = "no clip is left of 2: 2 no_trajectory (street_0: no_trajectory="
+    for command in (["label", "--out", root, "--workers", "0"], ["status", root], ["pack", "-o", root]):
+        code, out, _ = run(*command)
+        assert code == 1 and why in out and "import trajectories that cover the videos" in out, command
+    assert why in run("inspect", root)[1]
 
 
 def bad_yaml(tmp_path, text):
