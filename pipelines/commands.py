@@ -2,7 +2,7 @@
 
 import csv
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,10 @@ from rich.markup import escape
 
 from dataset.receipts import Receipt, storage_errors
 from dataset.selection import read_selection
+from labeling.captions import read_caption_table
 from labeling.ego_import import FileClock
 from labeling.errors import ConfigError
-from labeling.extractors import Extractors
+from labeling.extractors import ExtractorChoice, Extractors, choose_extractors
 from labeling.onnx_model import resolve_providers
 from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, with_effort
 from pipelines.console import ConsoleReporter, print_failures
@@ -54,8 +55,7 @@ def run_label(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
         AnimaticError: something a person can mend before anything is spent.
     """
     reporter = ConsoleReporter()
-    job = prepare_job(videos, out, options)
-    check_extractors(job, reporter)
+    job = prepare_job(videos, out, options, check=lambda job: check_extractors(job, reporter))
     reports = run_job(job, ALL_STAGES, options, reporter)
     sweep_outdated(job)
     return _finish(job, reports, reporter)
@@ -71,7 +71,7 @@ def run_slice(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
 def run_index(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
     """Index, on a new job or one that is there; 0, or 1 where something failed."""
     reporter = ConsoleReporter()
-    job = prepare_job(videos, out, options)
+    job = prepare_job(videos, out, options, check=chosen_cards)
     return _finish(job, run_job(job, COMMAND_STAGES["index"], options, reporter), reporter)
 
 
@@ -121,12 +121,22 @@ def run_select(out: Path, *, extend: bool = False, refreeze: bool = False, worke
     return _finish(job, reports, reporter)
 
 
-def prepare_job(videos: Sequence[Path], out: Path, options: JobOptions) -> Job:
+def prepare_job(
+    videos: Sequence[Path], out: Path, options: JobOptions, *, check: Callable[[Job], object] | None = None
+) -> Job:
     """The job with its settings and videos, written to ``job.yaml``.
 
+    Args:
+        videos: to add to the job.
+        out: its folder.
+        options: on top of the job's settings.
+        check: raises for what the command could not use; what cannot be used leaves no ``job.yaml`` behind.
+
     Raises:
-        AnimaticError: settings, videos or a folder that cannot be used.
+        AnimaticError: settings, tables, videos, a part or a folder that cannot be used.
     """
+    if options.part is not None:
+        parse_part(options.part)
     sources = find_videos(videos, out=out) if videos else []
     job = open_or_create(out, videos=sources, models_dir=options.models, leave_out=options.leave_out)
     config = configured(job.config, options)
@@ -138,6 +148,8 @@ def prepare_job(videos: Sequence[Path], out: Path, options: JobOptions) -> Job:
     job = Job(absolute(job.root), config, job.sources, models_dir=job.models_dir)
     if options.models is not None and not options.models.is_dir():
         raise ConfigError(f"--models {options.models}: is no folder; give the folder that holds the ONNX files")
+    if check is not None:
+        check(job)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     job.save()
@@ -148,7 +160,8 @@ def configured(config: Config, options: JobOptions) -> Config:
     """Settings with a person's options on top.
 
     Raises:
-        ConfigError: an option that no setting allows.
+        ConfigError: an option that no setting allows, or a table that cannot be read.
+        DataError: captions that cannot be read.
     """
     if options.config is not None:
         config = parse_config(read_yaml(options.config), str(options.config))
@@ -170,7 +183,10 @@ def configured(config: Config, options: JobOptions) -> Config:
         changes["pack"] = {"videos": options.videos}
     if options.captions is not None:
         changes["views"] = {"captions": str(absolute(options.captions))}
-    return merged(config, changes) if changes else config
+    config = merged(config, changes) if changes else config
+    if config.views.captions is not None:
+        read_caption_table(Path(config.views.captions))
+    return config
 
 
 def read_split(path: Path) -> dict[str, str]:
@@ -212,9 +228,8 @@ def check_extractors(job: Job, reporter: ConsoleReporter) -> None:
         ConfigError: no detector, though clips are to be ranked by what they show.
         ModelError: weights that break their card's contract, or a provider that is not there.
     """
-    choice = job_extractors(job)
-    detector = job.config.count.detector or choice.detector
-    if detector is None and job.config.select.keep_share < 1:
+    choice, counting = chosen_cards(job)
+    if counting.detector is None and job.config.select.keep_share < 1:
         raise ConfigError(NO_DETECTOR)
     resolve_providers(job.config.count.providers)
     settings = job.config.keypoints
@@ -226,6 +241,22 @@ def check_extractors(job: Job, reporter: ConsoleReporter) -> None:
             f"{'':>10} no keypoints of {', '.join(choice.missing_categories)}: no weights for "
             f"{', '.join(choice.absent) or 'them'} (`animatic models` says how to get them)"
         )
+
+
+def chosen_cards(job: Job) -> tuple[ExtractorChoice, ExtractorChoice]:
+    """The cards that label a job, and those that its objects are counted by.
+
+    Raises:
+        ConfigError: a name that no card has, or ``count.detector`` is that of no detector.
+        ModelError: a card that is named has no weights.
+    """
+    choice, name = job_extractors(job), job.config.count.detector
+    if name is None:
+        return choice, choice
+    counting = choose_extractors((name,), models_dir=job.models_dir)
+    if counting.detector is None:
+        raise ConfigError(f"count.detector: {name!r} is no detector; choose a card of boxes from `animatic models`")
+    return choice, counting
 
 
 def run_job(job: Job, stages: Sequence[str], options: JobOptions, reporter: ConsoleReporter) -> list[StageReport]:

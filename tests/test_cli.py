@@ -240,13 +240,19 @@ def bad_yaml(tmp_path, text):
         (lambda t, v: [v, "-o", t / "J", "--models", spoilt(t, b"<html>not found</html>")], "counter.onnx"),
         (lambda t, v: [v, "-o", t / "J", "--models", spoilt(t, None)], "sha256"),
         (lambda t, v: [v, "-o", in_the_way(t) / "J", "--keep-share", "1"], "give a folder that can be written to"),
+        (lambda t, v: [v, "-o", t / "J", "--config", bad_yaml(t, "count: {detector: nope}")], "card is called 'nope'"),
+        (
+            lambda t, v: [v, "-o", t / "J", "--config", bad_yaml(t, "count: {detector: street_fields}")],
+            "count.detector: 'street_fields' is no detector",
+        ),
+        (lambda t, v: [v, "-o", t / "J", "--keep-share", "1", "--captions", t / "none.csv"], "as a caption table"),
         (lambda t, v: [v, "-o", t / "J", "--leave-out", bad_yaml(t, "video_id,start_s\nx,1")], "has no column"),
         (lambda t, v: [v, "-o", t / "J", "--leave-out", bad_yaml(t, "video_id,start_s,end_s\nx,1,1")], "names 'x'"),
     ],
     ids=[
         "missing", "empty folder", "nothing", "dot", "same id", "unknown key", "broken YAML", "list", "GOP", "share",
-        "effort", "part", "no detector", "no models", "no card", "no weights", "HTML", "hash", "unwritable", "column",
-        "unknown video",
+        "effort", "part", "no detector", "no models", "no card", "no weights", "HTML", "hash", "unwritable",
+        "no counter", "counter of another kind", "captions", "column", "unknown video",
     ],
 )  # fmt: skip
 def test_what_can_be_mended_is_one_line_and_exit_code_2(run, video, tmp_path, make, message):
@@ -254,7 +260,17 @@ def test_what_can_be_mended_is_one_line_and_exit_code_2(run, video, tmp_path, ma
     assert code == 2
     assert message in err and "Traceback" not in out + err
     assert err.count("\n") == 1
-    assert not (tmp_path / "J" / "videos").exists()
+    assert not (tmp_path / "J").exists(), "what cannot be used leaves no job behind"
+
+
+@pytest.mark.parametrize("changes", [["--part", "3/2"], ["--extractors", "nope"]], ids=["part", "card"])
+def test_a_command_that_is_refused_leaves_a_job_as_it_was(run, job, tmp_path, changes):
+    root = shutil.copytree(job, tmp_path / "J")
+    before = (root / "job.yaml").read_bytes()
+    for command in ("label", "index"):
+        assert run(command, "--out", root, "--workers", "0", *changes)[0] == 2
+        assert (root / "job.yaml").read_bytes() == before
+    assert run("label", "--out", root, "--workers", "0")[0] == 0
 
 
 def copied(video, path):
