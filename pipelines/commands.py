@@ -23,6 +23,7 @@ from pipelines.imports import import_trajectories
 from pipelines.job import Job, open_job, open_or_create
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
 from pipelines.layout import SELECTION
+from pipelines.models import check_models_folder
 from pipelines.nothing_left import clips_packed, why_nothing_is_left
 from pipelines.sources import absolute, find_videos
 from pipelines.stage import COMMAND_STAGES, Part, parse_part
@@ -146,8 +147,7 @@ def prepare_job(
             f"cameras: {unknown[0]!r} is none of the videos; use ids, as {', '.join(list(job.sources)[:3])}"
         )
     job = Job(absolute(job.root), config, job.sources, models_dir=job.models_dir)
-    if options.models is not None and not options.models.is_dir():
-        raise ConfigError(f"--models {options.models}: is no folder; give the folder that holds the ONNX files")
+    check_models_folder(options.models)
     if check is not None:
         check(job)
     with storage_errors(out):

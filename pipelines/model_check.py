@@ -17,6 +17,7 @@ from labeling.model_cards import SimccCard, find_weights, load_cards, weights_fo
 from labeling.model_check import check_card
 from labeling.video import decode_at, read_packet_times
 from pipelines.console import make_console
+from pipelines.models import check_models_folder
 
 VIDEO_FRAMES = 10
 """Frames taken from a video, evenly spread."""
@@ -75,9 +76,10 @@ def print_check(name: str, images: Sequence[Path], *, models_dir: Path | None, a
     """Check one card and show every way it was tried; 1 where another way fits better.
 
     Raises:
-        ConfigError: no such card, a picture that cannot be read, or, for a head, no box to look at.
+        ConfigError: no such folder or card, a picture that cannot be read, or, for a head, no box to look at.
         ModelError: its weights are not there, or break the contract.
     """
+    check_models_folder(models_dir)
     cards = load_cards(models_dir)
     if name not in cards:
         raise ConfigError(f"no model card is called {name!r}; choose one of {', '.join(cards)}")

@@ -20,6 +20,7 @@ from pipelines.config import Config
 from pipelines.engine import Engine
 from pipelines.job import Job
 from pipelines.label import ALL_STAGES, Reporter, StageReport, run_stages
+from pipelines.models import check_models_folder
 from pipelines.sources import Source, find_videos, with_leave_out
 from pipelines.stage import Part
 
@@ -87,6 +88,7 @@ def plan_job(
         ConfigError: settings or videos that cannot be used, or no video long enough for a clip.
     """
     config = configured(Config(), options)
+    check_models_folder(options.models)
     sources = find_videos(videos)
     if options.leave_out is not None:
         by_id = {source.video_id: source for source in sources}

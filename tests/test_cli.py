@@ -143,6 +143,17 @@ def test_models_are_listed_with_how_to_get_them(run, tmp_path):
     assert cards["counter"]["state"] == "present" and cards["yolox_nano"]["state"] == "absent"
 
 
+def test_a_folder_without_weights_is_said(run, monkeypatch, tmp_path):
+    code, out, _ = run("models", "--models", tmp_path)
+    assert code == 0 and f"weights are looked for in {tmp_path} (holds no .onnx file), then " in out
+    assert "holds no" not in run("models", "--models", write_detector(tmp_path / "m"))[1]
+    for command in (["models"], ["models", "check", "yolox_nano"], ["plan", tmp_path]):
+        code, _, err = run(*command, "--models", tmp_path / "none")
+        assert code == 2 and f"--models {tmp_path / 'none'}: is no folder" in err
+    monkeypatch.setenv("ANIMATIC_MODELS", str(tmp_path / "none"))
+    assert f"{tmp_path / 'none'} (there is no such folder)" in run("models")[1]
+
+
 def test_stages_are_commands_of_their_own(run, video, config, tmp_path):
     root = tmp_path / "J"
     code, _, err = run("cut", "--out", root)
