@@ -1,21 +1,23 @@
 """What a job would take, before anything is spent: clips, disk and hours, from a minute of the footage itself.
 
 Lengths come from the headers. Costs come from a small job on windows of the same videos, with the same settings,
-in a scratch folder; a still smaller one before it pays for loading and compiling.
+in a scratch folder; a still smaller one before it pays for loading and compiling. Windows are laid around clips that
+the videos' packets show to be whole, so that there is always something to measure on.
 """
 
+import functools
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dataset.receipts import Receipt, hashed_share, read_receipts
 from labeling.ego_calibration import ROAD_FRAMES
 from labeling.errors import ConfigError, VideoError
-from labeling.timeline import ClipSettings
-from labeling.video import probe
-from pipelines.commands import JobOptions, configured
+from labeling.timeline import ClipSettings, Span, plan_clips, plan_timeline
+from labeling.video import probe, read_packet_times
+from pipelines.commands import JobOptions, chosen_cards, configured
 from pipelines.config import Config
 from pipelines.engine import Engine
 from pipelines.job import Job
@@ -26,7 +28,6 @@ from pipelines.stage import Part
 
 CALIBRATION_S = 60.0
 _WINDOWS = 3
-_WARM_UP_CLIPS = 1
 _FPS = 24
 
 
@@ -48,7 +49,7 @@ class JobPlan:
     """Videos that cannot be opened, with the reason."""
     source_hours: float
     clips: int
-    """Candidates: all that fit on the videos' timelines, before holes are known."""
+    """Candidates: all that fit on the videos' timelines; of the videos that were measured on, those without a hole."""
     kept_clips: int
     """Kept by their objects."""
     sampled_clips: int
@@ -58,6 +59,10 @@ class JobPlan:
     stages: tuple[StageCost, ...]
     calibration_s: float
     """Seconds of footage that costs were measured on."""
+    calibration_clips: int
+    """Clips that were labelled for it."""
+    calibration_videos: int
+    """Videos that these are of."""
     workers: int
     parts: int
     largest_part: float
@@ -90,25 +95,30 @@ def plan_job(
     config = configured(Config(), options)
     check_models_folder(options.models)
     sources = find_videos(videos)
+    chosen_cards(Job(Path(), config, {}, models_dir=options.models))
     if options.leave_out is not None:
         by_id = {source.video_id: source for source in sources}
         sources = list(with_leave_out(by_id, options.leave_out).values())
     lengths, broken = _lengths_s(sources)
     candidates = {name: count_candidates(length, config.clip) for name, length in lengths.items()}
-    total = sum(candidates.values())
-    if total == 0:
-        raise ConfigError(f"none of {len(sources)} videos is long enough for one clip of {_clip_s(config.clip):g} s")
     usable = [source for source in sources if candidates.get(source.video_id)]
-    windows = plan_windows(usable, lengths, clip=config.clip, seconds=calibration_s)
-    receipts = _calibrate(windows, config, options.models)
+    if not usable:
+        raise ConfigError(f"none of {len(sources)} videos is long enough for one clip of {_clip_s(config.clip):g} s")
+    clips_of = functools.cache(functools.partial(read_clips, clip=config.clip))
+    receipts = _calibrate(usable, clips_of, config, options.models, seconds=calibration_s)
     measured = _Measured.of(receipts)
+    candidates |= {
+        source.video_id: len(clips_of(source).clips) for source in usable if source.video_id in receipts["index"]
+    }
+    total = sum(candidates.values())
     kept = max(1, round(total * measured.kept_clips / measured.clips))
     sampled = min(kept, config.select.sample_clips or kept)
     return JobPlan(
         videos=len(lengths), broken=broken, source_hours=sum(lengths.values()) / 3600, clips=total, kept_clips=kept,
         sampled_clips=sampled, clip_hours=sampled * _clip_s(config.clip) / 3600,
         stages=_scaled(receipts, measured, lengths, candidates=candidates, sampled=sampled),
-        calibration_s=measured.window_s, workers=workers, parts=parts,
+        calibration_s=measured.window_s, calibration_clips=measured.kept_clips,
+        calibration_videos=measured.videos, workers=workers, parts=parts,
         largest_part=_largest_part(lengths, parts),
     )  # fmt: skip
 
@@ -119,28 +129,66 @@ def count_candidates(length_s: float, clip: ClipSettings) -> int:
     return 0 if frames < clip.clip_frames else (frames - clip.clip_frames) // clip.stride_frames + 1
 
 
-def plan_windows(
-    sources: Sequence[Source], lengths_s: dict[str, float], *, clip: ClipSettings, seconds: float
-) -> list[Source]:
-    """Some of the videos with all but a window in their middle left out, ``seconds`` together.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceClips:
+    """Where the clips of a video lie on its grid."""
 
-    Videos are drawn by the hash of their id; each gives an equal share, short ones all they have.
+    frames: int
+    """Of the grid."""
+    clips: tuple[Span, ...]
+    """In order; those that touch a hole or what is left out are not among them."""
+
+    def around(self, clips: Sequence[Span]) -> tuple[float, float]:
+        """Seconds to leave out at the start and at the end so that only ``clips`` are left, half a frame to spare."""
+        return max(0.0, (clips[0].start - 0.5) / _FPS), max(0.0, (self.frames - clips[-1].end - 0.5) / _FPS)
+
+
+def read_clips(source: Source, clip: ClipSettings) -> SourceClips:
+    """The clips of a video, from its packets.
+
+    Raises:
+        VideoError: it is no video that can be used.
+    """
+    timeline = plan_timeline(read_packet_times(source.path).times_s)
+    plan = plan_clips(
+        timeline, clip_frames=clip.clip_frames, stride_frames=clip.stride_frames, leave_out_s=source.leave_out_s
+    )
+    return SourceClips(frames=len(timeline), clips=plan.kept)
+
+
+def plan_windows(
+    sources: Sequence[Source], clips_of: Callable[[Source], SourceClips], *, clip_frames: int, seconds: float
+) -> list[Source]:
+    """Some of the videos with all but some clips in their middle left out, ``seconds`` together.
+
+    Videos are drawn by the hash of their id; each gives an equal share, at least one clip, short ones all they have.
+    Those that hold no clip are passed over, since nothing could be measured on them.
     """
     drawn = sorted(sources, key=lambda source: hashed_share("plan", source.video_id))
-    least = _clip_s(clip) + 1 / _FPS
     windows: list[Source] = []
-    left = seconds
-    for position, source in enumerate(drawn):
-        if left <= 0:
+    left = seconds * _FPS
+    for source in drawn:
+        if windows and left < clip_frames:
             break
-        share = left / max(1, min(_WINDOWS, len(drawn)) - position)
-        start, end = source.leave_out_s
-        usable = lengths_s[source.video_id]
-        window = min(usable, max(least, share))
-        margin = (usable - window) / 2
-        windows.append(replace(source, leave_out_s=(start + margin, end + margin)))
-        left -= window
+        found = clips_of(source)
+        if found.clips:
+            share = left / max(1, min(_WINDOWS, len(drawn)) - len(windows))
+            clips = middle_clips(found.clips, share)
+            windows.append(replace(source, leave_out_s=found.around(clips)))
+            left -= clips[-1].end - clips[0].start
     return windows
+
+
+def middle_clips(clips: Sequence[Span], frames: float) -> Sequence[Span]:
+    """Neighbours around the middle clip that span at most ``frames``, and at least that clip."""
+    first = last = len(clips) // 2
+    while True:
+        wider = [(max(0, first - 1), last), (first, min(len(clips) - 1, last + 1))]
+        fits = [(a, b) for a, b in wider if (a, b) != (first, last) and clips[b].end - clips[a].start <= frames]
+        if not fits:
+            return clips[first : last + 1]
+        # The side that has had less comes first, so that the window stays in the middle.
+        first, last = min(fits, key=lambda pair: abs(pair[0] + pair[1] - len(clips) + 1))
 
 
 def _lengths_s(sources: Sequence[Source]) -> tuple[dict[str, float], tuple[str, ...]]:
@@ -175,14 +223,28 @@ class _Quiet(Reporter):
         """Nothing."""
 
 
-def _calibrate(windows: Sequence[Source], config: Config, models_dir: Path | None) -> dict[str, dict[str, Receipt]]:
-    """Receipts of a small job on the windows; a still smaller one before it pays for loading and compiling."""
+def _calibrate(
+    sources: Sequence[Source],
+    clips_of: Callable[[Source], SourceClips],
+    config: Config,
+    models_dir: Path | None,
+    *,
+    seconds: float,
+) -> dict[str, dict[str, Receipt]]:
+    """Receipts of a small job on windows of videos; one on a single clip before it pays for loading and compiling.
+
+    Raises:
+        ConfigError: no video holds a whole clip.
+    """
+    clip = config.clip
+    windows = plan_windows(sources, clips_of, clip_frames=clip.clip_frames, seconds=seconds)
+    if not windows:
+        raise ConfigError(
+            f"none of {len(sources)} videos holds a clip of {_clip_s(clip):g} s without a hole, so none would be kept; "
+            "give recordings without gaps, or a smaller clip.clip_frames with --config"
+        )
+    (warm_up,) = plan_windows(sources, clips_of, clip_frames=clip.clip_frames, seconds=0)
     unsampled = config.model_copy(update={"select": config.select.model_copy(update={"sample_clips": None})})
-    first = windows[0]
-    clip_s = _clip_s(config.clip) * _WARM_UP_CLIPS
-    start, end = first.leave_out_s
-    spare = max(0.0, probe(first.path).duration_s - start - end - clip_s - 0.5)
-    warm_up = replace(first, leave_out_s=(start, end + spare))
     with tempfile.TemporaryDirectory(prefix="animatic-plan-") as scratch:
         _run(Path(scratch) / "warm-up", [warm_up], unsampled, models_dir)
         return _run(Path(scratch) / "job", windows, unsampled, models_dir)
@@ -207,6 +269,8 @@ class _Measured:
 
     window_s: float
     video_s: float
+    videos: int
+    """That the windows' kept clips are of."""
     clips: int
     kept_clips: int
     frames_per_clip: float
@@ -227,7 +291,7 @@ class _Measured:
         for receipt in receipts["cut"].values():
             frames[receipt.item.split("/")[0]] += int(receipt.facts["frames"])
         return cls(
-            window_s=frames.total() / _FPS,
+            window_s=frames.total() / _FPS, videos=len(frames),
             video_s=sum(float(receipt.facts["seconds"]) for receipt in receipts["index"].values()),
             clips=clips, kept_clips=kept, frames_per_clip=frames.total() / kept,
             camera_frames=sum(min(count, ROAD_FRAMES) for count in frames.values()),

@@ -36,7 +36,8 @@ def show_plan(videos: Sequence[Path], options: JobOptions, *, parts: int, as_jso
     hosts = f"on each of {plan.parts} hosts (the busiest has {plan.largest_part:.0%})" if plan.parts > 1 else "here"
     console.print(
         f"[bold]{hours(plan.hours_per_host)}[/] {hosts} with {plan.workers} workers, "
-        f"[bold]{size(plan.disk_bytes)}[/] of disk; measured on {plan.calibration_s:.0f} s of the footage"
+        f"[bold]{size(plan.disk_bytes)}[/] of disk; measured on {plan.calibration_s:.3g} s "
+        f"of the footage ({plan.calibration_clips} clips of {plan.calibration_videos} videos)"
     )
     return 0
 

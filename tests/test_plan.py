@@ -1,20 +1,25 @@
 """The plan against the truth of the job that then runs: clips and bytes here, hours in a benchmark."""
 
 import json
+from dataclasses import replace
+from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from pipeline_fixtures import SMALL, run_all, small_config, write_detector, write_street
+from video_fixtures import write_source
 
 from dataset.receipts import Receipt
 from dataset.selection import read_selection
 from labeling.ego_calibration import ROAD_FRAMES
 from labeling.errors import ConfigError
-from labeling.timeline import ClipSettings
+from labeling.timeline import ClipSettings, plan_clips, plan_timeline
 from pipelines.commands import JobOptions
 from pipelines.job import Job
-from pipelines.plan import _Measured, _scaled, count_candidates, plan_job, plan_windows
+from pipelines.plan import SourceClips, _Measured, _scaled, count_candidates, plan_job, plan_windows
 from pipelines.plan_console import hours, show_plan, size
 from pipelines.sources import Source, find_videos
 
@@ -54,21 +59,60 @@ def test_parts_share_the_footage(videos: Path, options: JobOptions, capsys: pyte
     assert plan["hours_per_host"] == pytest.approx(plan["core_hours"] * plan["largest_part"] / plan["workers"])
 
 
+def clips_of(length_s: float, source: Source) -> SourceClips:
+    """A video without holes."""
+    clip = ClipSettings()
+    timeline = plan_timeline(np.arange(round(length_s * 24)) / 24)
+    plan = plan_clips(timeline, clip_frames=clip.clip_frames, leave_out_s=source.leave_out_s)
+    return SourceClips(frames=len(timeline), clips=plan.kept)
+
+
+def windows_of(sources: list[Source], length_s: float, seconds: float) -> list[Source]:
+    return plan_windows(sources, partial(clips_of, length_s), clip_frames=121, seconds=seconds)
+
+
 def test_windows_lie_in_the_middle_and_add_up() -> None:
     sources = [Source(video_id=f"v{i}", path=Path(f"v{i}.mp4"), leave_out_s=(10.0, 0.0)) for i in range(5)]
-    lengths = {source.video_id: 600.0 for source in sources}
-    windows = plan_windows(sources, lengths, clip=ClipSettings(), seconds=60)
+    windows = windows_of(sources, 610.0, 60)
     assert len(windows) == 3
     for window in windows:
         start, end = window.leave_out_s
-        assert 610.0 - start - end == pytest.approx(20.0)
-        assert start - 10 == pytest.approx(end)
+        assert abs((start - 10) - end) <= 2 * 48 / 24
+    kept = [clips_of(610.0, window).clips for window in windows]
+    assert [len(clips) for clips in kept] == [8, 8, 9]
+    assert 60 - 48 / 24 < sum(clips[-1].end - clips[0].start for clips in kept) / 24 <= 60
 
 
 def test_short_videos_give_all_they_have() -> None:
     sources = [Source(video_id=f"v{i}", path=Path(f"v{i}.mp4")) for i in range(20)]
-    windows = plan_windows(sources, {s.video_id: 6.0 for s in sources}, clip=ClipSettings(), seconds=60)
-    assert len(windows) == 10 and all(window.leave_out_s == (0, 0) for window in windows)
+    windows = windows_of(sources, 6.0, 60)
+    assert len(windows) == 11 and all(len(clips_of(6.0, window).clips) == 1 for window in windows)
+
+
+@pytest.mark.parametrize("seconds", [0, 1, 5.1, 8, 20, 1000])
+@pytest.mark.parametrize("length_s", [5.1, 6.0, 8.3, 61.7])
+def test_no_window_falls_between_the_clips(length_s: float, seconds: float) -> None:
+    (window,) = windows_of([Source(video_id="v", path=Path("v.mp4"))], length_s, seconds)
+    kept = clips_of(length_s, window).clips
+    assert kept and (len(kept) == 1 or kept[-1].end - kept[0].start <= 24 * seconds)
+
+
+def test_videos_whose_middle_is_a_hole_are_measured_beside_it(
+    tmp_path: Path, options: JobOptions, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times = [Fraction(frame, 24) + (3 if frame >= 24 else 0) for frame in range(48)]
+    write_source(tmp_path / "v.mp4", times)
+    plan = plan_job([tmp_path], replace(options, keep_share=1.0), workers=1, calibration_s=0.5)
+    assert (plan.clips, plan.calibration_clips, plan.calibration_videos) == (4, 1, 1)
+    assert plan.disk_bytes > 0 and plan.calibration_s == pytest.approx(9 / 24)
+    assert show_plan([tmp_path], replace(options, keep_share=1.0), parts=1, as_json=False) == 0
+    assert "(4 clips of 1 videos)" in capsys.readouterr().out
+
+
+def test_videos_of_which_no_clip_is_whole_are_an_error(tmp_path: Path, options: JobOptions) -> None:
+    write_source(tmp_path / "v.mp4", [Fraction(frame, 24) + frame // 6 for frame in range(48)])
+    with pytest.raises(ConfigError, match="none of 1 videos holds a clip of 0.375 s without a hole"):
+        plan_job([tmp_path], replace(options, keep_share=1.0), workers=1)
 
 
 @pytest.mark.parametrize(("seconds", "clips"), [(4.9, 0), (5.0, 1), (6.9, 1), (7.0, 2), (3600, 1798)])
@@ -80,6 +124,12 @@ def test_videos_too_short_for_a_clip_are_an_error(tmp_path: Path, options: JobOp
     write_street(tmp_path / "blink.mp4", frames=4)
     with pytest.raises(ConfigError, match="long enough"):
         plan_job([tmp_path / "blink.mp4"], options, workers=1)
+
+
+def test_a_card_that_is_not_there_is_named(tmp_path: Path, videos: Path) -> None:
+    (tmp_path / "settings.yaml").write_text("count: {detector: nope}")
+    with pytest.raises(ConfigError, match="no model card is called 'nope'"):
+        plan_job([videos], JobOptions(config=tmp_path / "settings.yaml"), workers=1)
 
 
 def test_readable_units() -> None:
