@@ -17,7 +17,8 @@ from labeling.errors import ConfigError
 from labeling.extractors import ExtractorChoice, Extractors, choose_extractors
 from labeling.onnx_model import resolve_providers
 from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, with_effort
-from pipelines.console import ConsoleReporter, print_failures
+from pipelines.console import ConsoleReporter, print_damaged, print_failures
+from pipelines.damage import damaged_videos
 from pipelines.engine import Engine
 from pipelines.imports import import_trajectories
 from pipelines.job import Job, open_job, open_or_create
@@ -271,6 +272,8 @@ def _finish(job: Job, reports: Sequence[StageReport], reporter: ConsoleReporter)
     failed: list[Receipt] = [receipt for report in reports for receipt in report.failed]
     print_failures(failed, reporter.console)
     stages = {report.stage for report in reports}
+    if stages & {"index", "cut"}:
+        print_damaged(damaged_videos(job), reporter.console)
     if _is_empty(job, stages):
         reporter.console.print(f"[red]{escape(why_nothing_is_left(job.root))}[/]")
         return 1

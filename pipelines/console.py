@@ -93,6 +93,22 @@ def print_error(error: Exception) -> None:
     make_console(stderr=True).print(f"[bold red]error:[/] {escape(' '.join(str(error).split()))}")
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things, in words: ``1 clip``, ``2 clips``."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
+def shortened(lines: Sequence[str], most: int) -> list[str]:
+    """The first ``most`` of some lines, and how many there are beyond them."""
+    return [*lines[:most], *([f"... and {len(lines) - most} more"] if len(lines) > most else [])]
+
+
+def print_damaged(lines: Sequence[str], console: Console, *, most: int = 3) -> None:
+    """Which videos are damaged, and how; of many, the first ``most``."""
+    for line in shortened(lines, most):
+        console.print(f"[yellow]damaged[/] {escape(line)}")
+
+
 def print_failures(failed: Sequence[Receipt], console: Console, *, most: int = 20) -> None:
     """Which items failed, and why; of many, the first ``most``."""
     if not failed:

@@ -1,30 +1,34 @@
 """What a job would take, before anything is spent: clips, disk and hours, from a minute of the footage itself.
 
-Lengths come from the headers. Costs come from a small job on windows of the same videos, with the same settings,
-in a scratch folder; a still smaller one before it pays for loading and compiling. Windows are laid around clips that
-the videos' packets show to be whole, so that there is always something to measure on.
+Lengths come from the headers, of files that are cut off from the packets. Costs come from a small job on windows of the
+same videos, with the same settings, in a scratch folder; a still smaller one before it pays for loading and compiling.
+Windows are laid around clips that the packets show to be whole, so that there is always something to measure on.
 """
 
 import functools
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from dataset.receipts import Receipt, hashed_share, read_receipts
 from labeling.ego_calibration import ROAD_FRAMES
 from labeling.errors import ConfigError, VideoError
+from labeling.mp4_boxes import is_cut_off
 from labeling.timeline import ClipSettings, Span, plan_clips, plan_timeline
 from labeling.video import probe, read_packet_times
 from pipelines.commands import JobOptions, chosen_cards, configured
 from pipelines.config import Config
+from pipelines.damage import damage_lines
 from pipelines.engine import Engine
 from pipelines.job import Job
 from pipelines.label import ALL_STAGES, Reporter, StageReport, run_stages
 from pipelines.models import check_models_folder
 from pipelines.sources import Source, find_videos, with_leave_out
 from pipelines.stage import Part
+from pipelines.stages_source import packet_facts
 
 CALIBRATION_S = 60.0
 _WINDOWS = 3
@@ -47,6 +51,8 @@ class JobPlan:
     videos: int
     broken: tuple[str, ...]
     """Videos that cannot be opened, with the reason."""
+    damaged: tuple[str, ...]
+    """Videos that are less than they claim, as far as is known: files cut off, and those that were measured on."""
     source_hours: float
     clips: int
     """Candidates: all that fit on the videos' timelines; of the videos that were measured on, those without a hole."""
@@ -99,7 +105,7 @@ def plan_job(
     if options.leave_out is not None:
         by_id = {source.video_id: source for source in sources}
         sources = list(with_leave_out(by_id, options.leave_out).values())
-    lengths, broken = _lengths_s(sources)
+    lengths, cut_off, broken = _lengths_s(sources)
     candidates = {name: count_candidates(length, config.clip) for name, length in lengths.items()}
     usable = [source for source in sources if candidates.get(source.video_id)]
     if not usable:
@@ -113,9 +119,11 @@ def plan_job(
     total = sum(candidates.values())
     kept = max(1, round(total * measured.kept_clips / measured.clips))
     sampled = min(kept, config.select.sample_clips or kept)
+    looked = {name: receipt.facts for name, receipt in receipts["index"].items()}
+    damaged = damage_lines(cut_off | looked, receipts["cut"].values())
     return JobPlan(
-        videos=len(lengths), broken=broken, source_hours=sum(lengths.values()) / 3600, clips=total, kept_clips=kept,
-        sampled_clips=sampled, clip_hours=sampled * _clip_s(config.clip) / 3600,
+        videos=len(lengths), broken=broken, damaged=tuple(damaged), source_hours=sum(lengths.values()) / 3600,
+        clips=total, kept_clips=kept, sampled_clips=sampled, clip_hours=sampled * _clip_s(config.clip) / 3600,
         stages=_scaled(receipts, measured, lengths, candidates=candidates, sampled=sampled),
         calibration_s=measured.window_s, calibration_clips=measured.kept_clips,
         calibration_videos=measured.videos, workers=workers, parts=parts,
@@ -191,20 +199,28 @@ def middle_clips(clips: Sequence[Span], frames: float) -> Sequence[Span]:
         first, last = min(fits, key=lambda pair: abs(pair[0] + pair[1] - len(clips) + 1))
 
 
-def _lengths_s(sources: Sequence[Source]) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Usable seconds by video, and the videos that cannot be opened."""
+def _lengths_s(
+    sources: Sequence[Source],
+) -> tuple[dict[str, float], dict[str, Mapping[str, Any]], tuple[str, ...]]:
+    """Usable seconds by video, what the packets of files that are cut off hold, and those that cannot be opened."""
     lengths: dict[str, float] = {}
+    cut_off: dict[str, Mapping[str, Any]] = {}
     broken = []
     for source in sources:
         try:
             info = probe(source.path)
             # The last frame is shown for its own time: the timeline ends where it begins.
-            lengths[source.video_id] = max(0.0, info.duration_s - 1 / info.frame_rate - sum(source.leave_out_s))
+            length_s = info.duration_s - 1 / (info.frame_rate or _FPS)
+            if is_cut_off(source.path):
+                # The header promises what is no longer there; only the packets know.
+                cut_off[source.video_id] = packet_facts(info, read_packet_times(source.path))
+                length_s = cut_off[source.video_id]["seconds"]
+            lengths[source.video_id] = max(0.0, length_s - sum(source.leave_out_s))
         except VideoError as error:
             broken.append(str(error))
     if not lengths:
         raise ConfigError(f"none of {len(sources)} videos can be opened: {broken[0]}")
-    return lengths, tuple(broken)
+    return lengths, cut_off, tuple(broken)
 
 
 class _Quiet(Reporter):

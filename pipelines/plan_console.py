@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.table import Table
 
 from pipelines.commands import JobOptions
-from pipelines.console import make_console
+from pipelines.console import make_console, print_damaged
 from pipelines.plan import JobPlan, plan_job
 
 
@@ -28,6 +28,7 @@ def show_plan(videos: Sequence[Path], options: JobOptions, *, parts: int, as_jso
     console = make_console()
     for reason in plan.broken:
         console.print(f"[red]left out[/] {reason}")
+    print_damaged(plan.damaged, console)
     console.print(
         f"{plan.videos} videos, {hours(plan.source_hours)} of footage; {plan.clips} clips, {plan.kept_clips} kept, "
         f"{plan.sampled_clips} taken ({hours(plan.clip_hours)})"

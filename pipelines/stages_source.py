@@ -12,7 +12,7 @@ from labeling.camera import PictureMap, cover_map
 from labeling.encoding import EncoderSettings
 from labeling.errors import VideoError
 from labeling.timeline import Span, cut_run, plan_runs, plan_timeline
-from labeling.video import frame_count, probe, read_packet_times
+from labeling.video import PacketTimes, VideoInfo, frame_count, probe, read_packet_times
 from pipelines.config import PictureSettings
 from pipelines.job import Job
 from pipelines.layout import SELECTION, index_path, run_item, run_path
@@ -88,10 +88,17 @@ class IndexStage:
         )
         write_index(staging / "index.parquet", index)
         return {
-            "seconds": round(float(packets.times_s[-1] - packets.times_s[0]), 6),
-            "frames": len(packets.times_s), "keyframes": int(packets.is_keyframe.sum()),
+            **packet_facts(info, packets), "frames": len(packets.times_s), "keyframes": int(packets.is_keyframe.sum()),
             "width": info.width, "height": info.height,
         }  # fmt: skip
+
+
+def packet_facts(info: VideoInfo, packets: PacketTimes) -> dict[str, Any]:
+    """What a video's packets hold, and what its header promises: facts of the index."""
+    return {
+        "seconds": round(float(packets.times_s[-1] - packets.times_s[0]), 6), "promised_s": round(info.duration_s, 6),
+        "broken_packets": packets.broken_packets,
+    }  # fmt: skip
 
 
 class CutStage:

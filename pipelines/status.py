@@ -14,7 +14,8 @@ from dataset.loader import ShardDataset
 from dataset.receipts import read_receipts, reason_counts
 from dataset.selection import read_selection
 from labeling.errors import AnimaticError, ConfigError, DataError
-from pipelines.console import file_size, make_console
+from pipelines.console import file_size, make_console, print_damaged, shortened
+from pipelines.damage import damaged_videos
 from pipelines.job import Job, open_job
 from pipelines.layout import SELECTION, SHARD_INDEX
 from pipelines.nothing_left import clips_packed, why_nothing_is_left
@@ -49,6 +50,8 @@ class JobStatus:
     stages: tuple[StageStatus, ...]
     clips: Mapping[str, int]
     """Clips kept and dropped by the selection, by reason."""
+    damaged: tuple[str, ...]
+    """Videos that are less than they claim, with what they lack."""
     nothing_left: str
     """Why a job that is through holds no clip; empty where it holds some, and before."""
     next_command: str
@@ -67,7 +70,7 @@ def job_status(root: Path) -> JobStatus:
     command, reason = _next(root, stages, empty=bool(empty))
     return JobStatus(
         root=str(root), videos=len(job.sources), stages=stages, clips=_selected(root),
-        nothing_left=empty, next_command=command, next_reason=reason,
+        damaged=tuple(damaged_videos(job)), nothing_left=empty, next_command=command, next_reason=reason,
     )  # fmt: skip
 
 
@@ -155,6 +158,7 @@ def print_status(root: Path, *, as_json: bool = False) -> int:
         console.print("clips: " + ", ".join(f"{count} {name}" for name, count in status.clips.items()))
     for line in failure_lines(root):
         console.print(f"[red]{escape(line)}[/]")
+    print_damaged(status.damaged, console, most=20)
     if status.nothing_left:
         console.print(f"[red]{escape(status.nothing_left)}[/]")
     console.print(f"next: [bold]{status.next_command}[/]  [dim]({escape(status.next_reason)})[/]")
@@ -174,7 +178,7 @@ def failure_lines(root: Path, *, most: int = 20) -> list[str]:
         for receipt in read_receipts(root, stage).values()
         if receipt.state == "failed"
     ]
-    return lines[:most] + ([f"... and {len(lines) - most} more"] if len(lines) > most else [])
+    return shortened(lines, most)
 
 
 def inspect(
@@ -242,6 +246,8 @@ def _print_summary(root: Path, summary: Summary) -> None:
     for name, text in rows.items():
         table.add_row(name, escape(text))
     console.print(table)
+    if (root / "job.yaml").is_file():
+        print_damaged(damaged_videos(open_job(root)), console)
     if sum(summary.packed.values()):
         console.print(f"one clip: [bold]animatic inspect {root} {_some_key(root)} --sheet sheet.png[/]")
     elif not summary.kept or (root / SHARD_INDEX).is_file():
