@@ -17,7 +17,7 @@ from labeling.errors import ConfigError
 from labeling.extractors import ExtractorChoice, Extractors, choose_extractors
 from labeling.onnx_model import resolve_providers
 from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, with_effort
-from pipelines.console import ConsoleReporter, print_damaged, print_failures
+from pipelines.console import ConsoleReporter, counted, print_damaged, print_failures
 from pipelines.damage import damaged_videos
 from pipelines.engine import Engine
 from pipelines.imports import import_trajectories
@@ -98,7 +98,7 @@ def run_ego(
     taken = import_trajectories(job, imported, clock=clock)
     others = len(job.sources) - len(taken)
     reporter.console.print(
-        f"[bold]{'import':>10}[/] trajectories of {len(taken)} video{'s' * (len(taken) != 1)} ({', '.join(taken[:3])}"
+        f"[bold]{'import':>10}[/] trajectories of {counted(len(taken), 'video')} ({', '.join(taken[:3])}"
         f"{', ...' * (len(taken) > 3)}); {others} of the job's others stay as they are"
     )
     options = JobOptions(workers=workers, part=part)

@@ -6,7 +6,7 @@ from pathlib import Path
 from dataset.loader import Sample, ShardDataset
 from dataset.receipts import atomic_write
 from labeling.errors import ConfigError
-from pipelines.console import make_console
+from pipelines.console import counted, make_console
 
 
 def export_released(job: Path, out: Path, *, split: str = "train") -> int:
@@ -27,7 +27,7 @@ def export_released(job: Path, out: Path, *, split: str = "train") -> int:
     lines = [json.dumps(_export_clip(sample, out)) for sample in dataset]
     manifest = out / f"{split}.jsonl"
     atomic_write(manifest, ("\n".join(lines) + "\n").encode())
-    make_console().print(f"{len(lines)} clips in {manifest}")
+    make_console().print(f"{counted(len(lines), 'clip')} in {manifest}")
     return 0
 
 

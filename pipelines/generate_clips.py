@@ -18,7 +18,7 @@ from labeling.errors import ConfigError, DataError
 from labeling.object_video import object_frames
 from labeling.skeleton_video import draw_skeletons
 from labeling.timeline import Span
-from pipelines.console import counting_bar, make_console
+from pipelines.console import counted, counting_bar, make_console
 from pipelines.train import GenerateOptions, check_start, clip_conditions
 from training.backbone import SamplingSettings
 from training.config import PictureConfig
@@ -82,7 +82,7 @@ def show_clips(
             job, request, out=out, adapters={stage: path for stage, path in given.items() if path is not None},
             options=options, on_clip=lambda done, total: progress.update(task, completed=done, total=total),
         )  # fmt: skip
-    make_console().print(f"{made} clips generated, {there} were there; {out}")
+    make_console().print(f"{counted(made, 'clip')} generated, {there} there before; {out}")
 
 
 def generate_clips(

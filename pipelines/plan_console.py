@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.table import Table
 
 from pipelines.commands import JobOptions
-from pipelines.console import make_console, print_damaged
+from pipelines.console import counted, make_console, print_damaged
 from pipelines.plan import JobPlan, plan_job
 
 
@@ -30,15 +30,15 @@ def show_plan(videos: Sequence[Path], options: JobOptions, *, parts: int, as_jso
         console.print(f"[red]left out[/] {reason}")
     print_damaged(plan.damaged, console)
     console.print(
-        f"{plan.videos} videos, {hours(plan.source_hours)} of footage; {plan.clips} clips, {plan.kept_clips} kept, "
-        f"{plan.sampled_clips} taken ({hours(plan.clip_hours)})"
+        f"{counted(plan.videos, 'video')}, {hours(plan.source_hours)} of footage; {counted(plan.clips, 'clip')}, "
+        f"{plan.kept_clips} kept, {plan.sampled_clips} taken ({hours(plan.clip_hours)})"
     )
     console.print(_table(plan))
     hosts = f"on each of {plan.parts} hosts (the busiest has {plan.largest_part:.0%})" if plan.parts > 1 else "here"
     console.print(
-        f"[bold]{hours(plan.hours_per_host)}[/] {hosts} with {plan.workers} workers, "
+        f"[bold]{hours(plan.hours_per_host)}[/] {hosts} with {counted(plan.workers, 'worker')}, "
         f"[bold]{size(plan.disk_bytes)}[/] of disk; measured on {plan.calibration_s:.3g} s "
-        f"of the footage ({plan.calibration_clips} clips of {plan.calibration_videos} videos)"
+        f"of the footage ({counted(plan.calibration_clips, 'clip')} of {counted(plan.calibration_videos, 'video')})"
     )
     return 0
 

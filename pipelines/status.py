@@ -14,10 +14,11 @@ from dataset.loader import ShardDataset
 from dataset.receipts import read_receipts, reason_counts
 from dataset.selection import read_selection
 from labeling.errors import AnimaticError, ConfigError, DataError
-from pipelines.console import file_size, make_console, print_damaged, shortened
+from pipelines.console import counted, file_size, make_console, print_damaged, shortened
 from pipelines.damage import damaged_videos
 from pipelines.job import Job, open_job
 from pipelines.layout import SELECTION, SHARD_INDEX
+from pipelines.next_training import next_training
 from pipelines.nothing_left import clips_packed, why_nothing_is_left
 from pipelines.stage import COMMAND_STAGES, NotReadyError, item_state
 
@@ -121,7 +122,7 @@ def _next(root: Path, stages: tuple[StageStatus, ...], *, empty: bool) -> tuple[
     if empty:
         return again, "with other settings or videos: no clip is left"
     if stages[-1].done and (root / SHARD_INDEX).is_file():
-        return f"animatic inspect {root}", "everything is packed"
+        return next_training(root)
     return again, "nothing is packed yet"
 
 
@@ -134,7 +135,7 @@ def print_status(root: Path, *, as_json: bool = False) -> int:
         print(json.dumps(asdict(status), indent=1))
         return int(failed)
     table = Table(
-        title=f"{root}: {status.videos} video{'s' * (status.videos != 1)}",
+        title=f"{root}: {counted(status.videos, 'video')}",
         title_justify="left",
         box=None,
         pad_edge=False,
@@ -155,14 +156,19 @@ def print_status(root: Path, *, as_json: bool = False) -> int:
         )  # fmt: skip
     console.print(table)
     if status.clips:
-        console.print("clips: " + ", ".join(f"{count} {name}" for name, count in status.clips.items()))
+        console.print("clips: " + ", ".join(_verdicts(status.clips)))
     for line in failure_lines(root):
         console.print(f"[red]{escape(line)}[/]")
     print_damaged(status.damaged, console, most=20)
     if status.nothing_left:
         console.print(f"[red]{escape(status.nothing_left)}[/]")
-    console.print(f"next: [bold]{status.next_command}[/]  [dim]({escape(status.next_reason)})[/]")
+    console.print(f"next: [bold]{escape(status.next_command)}[/]  [dim]({escape(status.next_reason)})[/]")
     return int(failed)
+
+
+def _verdicts(clips: Mapping[str, int]) -> list[str]:
+    """``1 kept, 1 dropped (objects)``: a reason is a slug, and takes no plural."""
+    return [f"{count} kept" if name == "kept" else f"{count} dropped ({name})" for name, count in clips.items()]
 
 
 def _words(counts: Mapping[str, int], ending: str = "") -> list[str]:
@@ -233,7 +239,7 @@ def _print_summary(root: Path, summary: Summary) -> None:
     rule = f"at least {summary.threshold:.3g} objects" if summary.threshold is not None else "every clip"
     kept = f"kept {summary.kept} ({rule})" if summary.kept else "none kept"
     rows = {
-        "source": f"{summary.videos} videos, {summary.source_hours:.3g} h",
+        "source": f"{counted(summary.videos, 'video')}, {summary.source_hours:.3g} h",
         "clips": f"{summary.clips}, {kept}, packed {sum(summary.packed.values())} "
         f"({', '.join(f'{count} {split}' for split, count in summary.packed.items())}), {summary.clip_hours:.3g} h",
         "dropped": ", ".join(f"{count} {reason}" for reason, count in summary.dropped.items()) or "none",

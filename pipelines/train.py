@@ -13,7 +13,7 @@ from dataset.inspection import find_sample
 from dataset.loader import Sample
 from labeling.camera import Intrinsics, rebased_trajectory
 from labeling.errors import ConfigError
-from pipelines.console import counting_bar, file_size, make_console
+from pipelines.console import counted, counting_bar, file_size, make_console
 from pipelines.stage import parse_part
 from training.config import STAGES, Stage, load_config
 from training.dry_run import RunPlan
@@ -64,8 +64,8 @@ def run_cache(
         )  # fmt: skip
     gone = f"{summary.retired} are in the shards no longer, " if summary.retired else ""
     make_console().print(
-        f"{summary.made} clips encoded, {summary.kept} were there, {gone}{summary.captions} captions, "
-        f"{file_size(summary.bytes)} in {summary.folder}"
+        f"{counted(summary.made, 'clip')} encoded, {summary.kept} there before, {gone}"
+        f"{counted(summary.captions, 'caption')}, {file_size(summary.bytes)} in {summary.folder}"
     )
     return summary
 

@@ -76,10 +76,40 @@ def test_help_names_every_command_and_loads_nothing_heavy():
 
 def test_status_of_a_finished_job(run, job):
     code, out, _ = run("status", job)
-    assert code == 0 and f"next: animatic inspect {job}" in out
+    assert code == 0 and f"next: animatic cache {job} --backbone ltx-2b  (2 clips packed, which `animatic insp" in out
+    assert f"{job}: 1 video\n" in out and "clips: 2 kept\n" in out
     code, out, _ = run("status", job, "--json")
     stages = {stage["stage"]: stage for stage in json.loads(out)["stages"]}
     assert stages["cut"]["done"] == 1 and stages["render"]["done"] == 2 and not stages["pack"]["failed"]
+
+
+def test_status_goes_on_to_training(run, job, tmp_path):
+    """Latents of every clip, the motion adapter, the appearance adapter, a sample; the furthest backbone leads."""
+    root = shutil.copytree(job, tmp_path / "J")
+
+    def there(name):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+
+    def following():
+        code, out, _ = run("status", root, "--json")
+        return code, json.loads(out)["next_command"]
+
+    there("latents/ltx-2b/cache.json")
+    there("latents/ltx-2b/clips/street/street_0.safetensors")
+    assert following() == (0, f"animatic cache {root} --backbone ltx-2b")
+    assert "(1 of 2 clips have no latents)" in run("status", root)[1]
+    there("latents/ltx-2b/clips/street/street_8.safetensors")
+    assert following() == (0, f"animatic train motion --data {root} --config motion_ltx_2b")
+    there("adapters/motion_ltx_2b_motion/adapter.safetensors")
+    assert following() == (0, f"animatic train appearance --data {root} --config appearance_ltx_2b")
+    there("latents/mine/cache.json")
+    assert following() == (0, f"animatic train appearance --data {root} --config appearance_ltx_2b")
+    there("adapters/appearance_ltx_2b_appearance/adapter.safetensors")
+    adapters = "--motion {0}/motion_ltx_2b_motion --appearance {0}/appearance_ltx_2b_appearance"
+    assert following() == (
+        0, f"animatic generate --data {root} {adapters.format(root / 'adapters')} --out {root / 'samples'}"
+    )  # fmt: skip
 
 
 def test_a_finished_job_is_labelled_again_at_once(run, job):
@@ -89,7 +119,7 @@ def test_a_finished_job_is_labelled_again_at_once(run, job):
 
 def test_inspect_gives_a_summary_a_record_and_a_sheet(run, job, tmp_path):
     code, out, _ = run("inspect", job)
-    assert code == 0 and "kept 2 (every clip), packed 2" in out
+    assert code == 0 and "kept 2 (every clip), packed 2" in out and "1 video, " in out
     code, out, _ = run("inspect", job, "street_8", "--json", "--sheet", tmp_path / "s.png")
     record = json.loads(out)
     assert (code, record["key"], record["start"]) == (0, "street_8", 8)

@@ -106,7 +106,7 @@ def test_videos_whose_middle_is_a_hole_are_measured_beside_it(
     assert (plan.clips, plan.calibration_clips, plan.calibration_videos) == (4, 1, 1)
     assert plan.disk_bytes > 0 and plan.calibration_s == pytest.approx(9 / 24)
     assert show_plan([tmp_path], replace(options, keep_share=1.0), parts=1, as_json=False) == 0
-    assert "(4 clips of 1 videos)" in capsys.readouterr().out
+    assert "(4 clips of 1 video)" in capsys.readouterr().out
 
 
 def test_videos_of_which_no_clip_is_whole_are_an_error(tmp_path: Path, options: JobOptions) -> None:

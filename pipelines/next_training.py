@@ -1,0 +1,52 @@
+"""What to type next in a job that is packed: its latents, then its adapters, then a sample.
+
+Read from the names of files alone, since the modules that write them load torch.
+"""
+
+from pathlib import Path
+
+from dataset.shards import read_shard_index
+from pipelines.console import counted
+from pipelines.layout import SHARD_INDEX
+from training.config import BACKBONES, config_names
+
+_ADAPTERS = ("motion", "appearance")
+
+
+def next_training(root: Path) -> tuple[str, str]:
+    """The next command, and why."""
+    keys = {row.key for row in read_shard_index(root / SHARD_INDEX)}
+    stores = sorted(path.parent for path in (root / "latents").glob("*/cache.json"))
+    if not stores:
+        others = ", ".join(name for name in BACKBONES if name != "ltx-2b")
+        return (
+            f"animatic cache {root} --backbone ltx-2b",
+            f"{counted(len(keys), 'clip')} packed, which `animatic inspect {root}` shows; other backbones: {others}",
+        )
+    # Of several backbones the one that has come furthest.
+    return max((_next_of(root, store, keys) for store in stores), key=lambda step: step[0])[1:]
+
+
+def _next_of(root: Path, store: Path, keys: set[str]) -> tuple[int, str, str]:
+    """How far a backbone has come, the next command, and why."""
+    cached = {path.stem for path in store.glob("clips/*/*.safetensors")}
+    missing = len(keys - cached)
+    if missing:
+        return 0, f"animatic cache {root} --backbone {store.name}", f"{missing} of {len(keys)} clips have no latents"
+    made: list[Path] = []
+    for stage in _ADAPTERS:
+        recipe = _recipe(stage, store.name)
+        adapter = root / "adapters" / f"{recipe}_{stage}"
+        if not (adapter / "adapter.safetensors").is_file():
+            command = f"animatic train {stage} --data {root} --config {recipe}"
+            return 1 + len(made), command, f"latents of {store.name} are cached, no {stage} adapter is in {adapter}"
+        made.append(adapter)
+    motion, appearance = made
+    command = f"animatic generate --data {root} --motion {motion} --appearance {appearance} --out {root / 'samples'}"
+    return 1 + len(made), command, "both adapters are there"
+
+
+def _recipe(stage: str, backbone: str) -> str:
+    """The shipped recipe for a backbone, or where to put one of one's own."""
+    names = (f"{stage}_{backbone.replace('-', '_')}", backbone)
+    return next((name for name in names if name in config_names()), "RECIPE.yaml")
