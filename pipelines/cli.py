@@ -308,11 +308,15 @@ def export_released(
 @export_app.command("coco")
 def export_coco(
     job: JobFolder,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the JSON file and its images.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for the JSON file, and with --images for its pictures.")
+    ],
     split: Annotated[str, typer.Option(help="train or val.")] = "train",
-    images: Annotated[bool, typer.Option("--images", help="Write the frames as JPEG files too.")] = False,
+    images: Annotated[
+        bool, typer.Option("--images", help="Write the frames that the file names as JPEG files too.")
+    ] = False,
 ) -> None:
-    """Keypoints, boxes and tracks as COCO JSON."""
+    """Keypoints, boxes and tracks as COCO JSON; the pictures that it names are written with --images alone."""
     from pipelines.export_coco import export_coco as export
 
     raise typer.Exit(export(job, out, split=split, images=images))

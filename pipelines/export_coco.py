@@ -20,7 +20,7 @@ from labeling.labels import Keypoints
 from labeling.schemas import keypoint_schema
 from labeling.timeline import FPS, Span
 from labeling.video import read_frames
-from pipelines.console import make_console
+from pipelines.console import counted, make_console
 from pipelines.job import Job, open_job
 from pipelines.layout import parse_run_item, run_path
 from pipelines.stages_source import job_selection
@@ -84,7 +84,9 @@ def export_coco(job_folder: Path, out: Path, *, split: str = "train", images: bo
     if images:
         for run in runs:
             _write_images(job.root, run, out)
-    make_console().print(f"{sum(len(run.frames) for run in runs)} images of {len(runs)} runs in {table}")
+    count = counted(sum(len(run.frames) for run in runs), "image")
+    pictures = f"their pictures in {out / 'images'}" if images else "without their pictures: --images writes them too"
+    make_console().print(f"{count} of {counted(len(runs), 'run')} in {table}, {pictures}")
     return 0
 
 

@@ -153,7 +153,11 @@ def test_the_released_trainer_s_manifest(run, job, tmp_path):
 def test_keypoints_as_coco(run, job, tmp_path):
     code, out, _ = run("export", "coco", job, "--out", tmp_path)
     found = json.loads((tmp_path / "train.coco.json").read_text())
-    assert code == 0 and "17 images of 1 runs" in out and len(found["images"]) == 17
+    assert code == 0 and "17 images of 1 run in" in out and len(found["images"]) == 17
+    assert "without their pictures: --images writes them too" in out and not (tmp_path / "images").exists()
+    code, out, _ = run("export", "coco", job, "--out", tmp_path, "--images")
+    assert code == 0 and f"their pictures in {tmp_path / 'images'}" in out
+    assert all((tmp_path / image["file_name"]).is_file() for image in found["images"])
     assert run("export", "coco", job, "--out", tmp_path, "--split", "val")[0] == 2
 
 
