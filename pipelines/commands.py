@@ -142,11 +142,7 @@ def prepare_job(
     sources = find_videos(videos, out=out) if videos else []
     job = open_or_create(out, videos=sources, models_dir=options.models, leave_out=options.leave_out)
     config = configured(job.config, options)
-    unknown = sorted(set(config.cameras) - set(job.sources))
-    if unknown:
-        raise ConfigError(
-            f"cameras: {unknown[0]!r} is none of the videos; use ids, as {', '.join(list(job.sources)[:3])}"
-        )
+    _check_tables(config, list(job.sources))
     job = Job(absolute(job.root), config, job.sources, models_dir=job.models_dir)
     check_models_folder(options.models)
     if check is not None:
@@ -155,6 +151,15 @@ def prepare_job(
         out.mkdir(parents=True, exist_ok=True)
     job.save()
     return job
+
+
+def _check_tables(config: Config, video_ids: Sequence[str]) -> None:
+    unknown = sorted(set(config.cameras) - set(video_ids))
+    if unknown:
+        raise ConfigError(f"cameras: {unknown[0]!r} is none of the videos; use ids, as {', '.join(video_ids[:3])}")
+    missing = sorted(set(video_ids) - set(config.select.split or video_ids))
+    if missing:
+        raise ConfigError(f"the split names no split for video {missing[0]!r}; give train or val for every video")
 
 
 def configured(config: Config, options: JobOptions) -> Config:

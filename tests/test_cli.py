@@ -291,13 +291,14 @@ def bad_yaml(tmp_path, text):
             "count.detector: 'street_fields' is no detector",
         ),
         (lambda t, v: [v, "-o", t / "J", "--keep-share", "1", "--captions", t / "none.csv"], "as a caption table"),
+        (lambda t, v: [v, "-o", t / "J", "--split", bad_yaml(t, "video_id,split\nx,val")], "no split for video"),
         (lambda t, v: [v, "-o", t / "J", "--leave-out", bad_yaml(t, "video_id,start_s\nx,1")], "has no column"),
         (lambda t, v: [v, "-o", t / "J", "--leave-out", bad_yaml(t, "video_id,start_s,end_s\nx,1,1")], "names 'x'"),
     ],
     ids=[
         "missing", "empty folder", "nothing", "dot", "same id", "unknown key", "broken YAML", "list", "GOP", "share",
         "effort", "part", "no detector", "no models", "no card", "no weights", "HTML", "hash", "unwritable",
-        "no counter", "counter of another kind", "captions", "column", "unknown video",
+        "no counter", "counter of another kind", "captions", "split", "column", "unknown video",
     ],
 )  # fmt: skip
 def test_what_can_be_mended_is_one_line_and_exit_code_2(run, video, tmp_path, make, message):
