@@ -19,7 +19,7 @@ from training_fixtures import (  # noqa: F401
     tiny_job,
 )
 
-from labeling.errors import ConfigError, DataError
+from labeling.errors import ConfigError, DataError, ModelError
 from labeling.skeleton_video import draw_skeletons
 from training import latents as module
 from training.backbones import load_backbone
@@ -251,30 +251,80 @@ def test_the_vae_with_timestep_conditioning_decodes_the_same_for_a_seed() -> Non
     assert not np.array_equal(videos[0], videos[2])
 
 
-def test_weights_folder_and_missing_weights(tmp_path: Path) -> None:
-    from labeling.errors import ModelError
+def write_ltx(folder: Path) -> None:
+    """A tiny LTX repository, laid out as diffusers lays out the real one."""
     from training.tiny import tiny_text, tiny_transformer, tiny_vae
 
-    tiny_transformer().save_pretrained(tmp_path / "transformer")
-    tiny_vae().save_pretrained(tmp_path / "vae")
     tokenizer, encoder = tiny_text()
-    tokenizer.save_pretrained(tmp_path / "tokenizer")
-    text: Any = encoder
-    text.save_pretrained(tmp_path / "text_encoder")
-    told = {"kind": "ltx", "size": "2b", "weights": str(tmp_path), "dtype": "float32", "picture": PICTURE}
-    ours = load_backbone(backbone_config("ltx-2b", **told))
-    assert ours.fingerprint() == load_backbone(backbone_config("tiny")).fingerprint()
+    parts: dict[str, Any] = {
+        "transformer": tiny_transformer(), "vae": tiny_vae(), "tokenizer": tokenizer, "text_encoder": encoder,
+    }  # fmt: skip
+    for name, part in parts.items():
+        part.save_pretrained(folder / name)
+
+
+@pytest.fixture
+def empty_hub(tmp_path: Path, monkeypatch) -> Path:
+    """A hub's cache with nothing in it; whoever asks the network fails the test."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+
+    def refuse(*_: object, **__: object) -> None:
+        pytest.fail("the network was asked")
+
+    monkeypatch.setattr("socket.getaddrinfo", refuse)
+    return tmp_path / "hub"
+
+
+def test_weights_load_from_a_folder_and_from_the_hubs_cache(tmp_path: Path, empty_hub: Path) -> None:
+    told = {"dtype": "float32", "picture": PICTURE}
+    tiny = load_backbone(backbone_config("tiny")).fingerprint()
+    write_ltx(tmp_path / "LTX")
+    ours = load_backbone(backbone_config("ltx-2b", **told, weights=str(tmp_path / "LTX")))
+    assert ours.fingerprint() == tiny
     denoiser: Any = ours.denoiser
     assert denoiser.config["num_layers"] == 2
-    with pytest.raises(ModelError, match="could not be loaded from"):
-        load_backbone(backbone_config("ltx-2b", **{**told, "weights": str(tmp_path / "none")}), parts=["vae"])
+    repository = empty_hub / "models--Lightricks--LTX-Video"
+    shutil.copytree(tmp_path / "LTX", repository / "snapshots" / "abc")
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("abc")
+    assert load_backbone(backbone_config("ltx-2b", **told)).fingerprint() == tiny
+
+
+@pytest.mark.parametrize(
+    ("preset", "use", "message"),
+    [
+        ("ltx-2b", "vae", r"'Lightricks/LTX-Video' .*nothing is downloaded.*/hub lacks vae/config.json, vae/\*"),
+        ("ltx-2b", "vae", r"`hf download Lightricks/LTX-Video --include 'vae/\*'`.*`weights`.* YAML"),
+        ("ltx-13b", "denoiser", r"'Lightricks/LTX-Video-0.9.7-dev' .*lacks transformer/config.json"),
+        ("ltx-2b", "text", r"lacks tokenizer/tokenizer_config.json, text_encoder/config.json"),
+        ("svd", "text", r"'google/t5-v1_1-large' .*lacks tokenizer_config.json, config.json.*v1_1-large`"),
+        ("svd", "image", r"'stabilityai/.*lacks image_encoder/config.json"),
+    ],
+)
+def test_absent_weights_are_named_and_never_downloaded(empty_hub: Path, preset: str, use: str, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        load_backbone(backbone_config(preset), parts=[use])
+
+
+def test_a_folder_that_lacks_weights_or_holds_others_is_named(tmp_path: Path, empty_hub: Path) -> None:
+    def load(weights: Path, part: str) -> None:
+        load_backbone(backbone_config("ltx-2b", weights=str(weights)), parts=[part])
+
+    write_ltx(tmp_path / "LTX")
+    (tmp_path / "LTX" / "vae" / "diffusion_pytorch_model.safetensors").unlink()
+    with pytest.raises(ModelError, match=r"LTX lacks vae/\*.safetensors; copy them there"):
+        load(tmp_path / "LTX", "vae")
+    with pytest.raises(ModelError, match=r"none' are no folder and no file; name one that holds vae/config.json"):
+        load(tmp_path / "none", "vae")
+    (tmp_path / "LTX" / "transformer" / "diffusion_pytorch_model.safetensors").write_bytes(b"short")
+    with pytest.raises(ModelError, match="LTXVideoTransformer3DModel could not be loaded from"):
+        load(tmp_path / "LTX", "denoiser")
 
 
 def test_a_single_file_in_lightricks_own_names_loads(tmp_path: Path) -> None:
     """One file with the transformer under ``model.diffusion_model.``, as the released checkpoints are laid out."""
     from safetensors.torch import save_file
 
-    from labeling.errors import ModelError
     from training.tiny import tiny_transformer
 
     names = {"proj_in": "patchify_proj", "time_embed": "adaln_single", "norm_q": "q_norm", "norm_k": "k_norm"}

@@ -66,10 +66,11 @@ class BackboneConfig(_Settings):
     kind: Literal["tiny", "ltx", "svd", "tiny_svd"]
     size: Literal["tiny", "2b", "13b", "svd"] = "tiny"
     weights: str | None = None
-    """Local folder, single safetensors file, or hub id; None only for the tiny kinds (random, from ``seed``)."""
+    """Local folder, single safetensors file, or hub id, which is looked for in the hub's cache and never downloaded;
+    None only for the tiny kinds (random, from ``seed``)."""
     weights_config: str | None = None
     """For a single file: the folder or hub id whose ``transformer`` and ``vae`` configurations fit. None lets
-    diffusers tell by the file's keys and fetch them, which needs the hub."""
+    diffusers tell by the file's keys, and needs them in the hub's cache."""
     text_weights: str | None = None
     """Text encoder and tokenizer, where they are not part of ``weights``."""
     dtype: Literal["float32", "bfloat16"] = "float32"

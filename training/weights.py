@@ -1,8 +1,10 @@
 """Finding weights, and naming them by content."""
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,10 @@ from safetensors.torch import save
 from labeling.errors import ModelError
 
 _HOW_IT_WAS_LOADED = ("dtype", "torch_dtype", "architectures")
-_ADVICE = "give a local diffusers folder, a .safetensors file, or a hub id that this machine can reach"
+_HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
+_FILES = ("config.json", "*.safetensors")
+_WHERE = "`weights` or `text_weights` in a backbone's YAML, see README, Real weights"
+_SINGLE_FILE_ADVICE = "set backbone.weights_config to a diffusers folder whose configurations fit it"
 
 
 def load_pretrained(
@@ -20,25 +25,30 @@ def load_pretrained(
 ) -> Any:
     """A diffusers model from a folder or hub id (its ``subfolder``), or from a single-file checkpoint.
 
+    Nothing is downloaded, here and below: a hub id is looked for in the hub's cache.
+
     Args:
         kind: the diffusers class.
         source: folder, ``.safetensors`` file, or hub id.
         subfolder: the model's part of a folder or hub repository.
         dtype: of the weights in memory.
-        file_config: folder or hub id whose configuration a single file fits; None lets diffusers fetch it.
+        file_config: folder or hub id whose configuration a single file fits; None lets diffusers name it.
 
     Raises:
         ModelError: nothing there, or not this class's weights.
     """
-    try:
-        if Path(source).is_file():
-            where = {"config": file_config, "subfolder": subfolder} if file_config else {}
-            return kind.from_single_file(source, torch_dtype=dtype, **where)
-        return kind.from_pretrained(source, subfolder=subfolder, torch_dtype=dtype, use_safetensors=True)
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise ModelError(
-            f"{kind.__name__} could not be loaded from {source!r} ({_first_line(error)}); {_ADVICE}"
-        ) from error
+    what = kind.__name__
+    if Path(source).is_file():
+        told: dict[str, Any] = {}
+        if file_config:
+            told = {"config": str(_folder_with(file_config, f"{subfolder}/config.json")), "subfolder": subfolder}
+        with _loading(what, source, _SINGLE_FILE_ADVICE):
+            return kind.from_single_file(source, torch_dtype=dtype, local_files_only=True, **told)
+    folder = _folder_with(source, *(f"{subfolder}/{name}" for name in _FILES))
+    with _loading(what, source):
+        return kind.from_pretrained(
+            folder, subfolder=subfolder, torch_dtype=dtype, use_safetensors=True, local_files_only=True
+        )
 
 
 def load_text_encoder(source: str, *, dtype: torch.dtype, single_file: bool = False) -> tuple[Any, torch.nn.Module]:
@@ -51,14 +61,17 @@ def load_text_encoder(source: str, *, dtype: torch.dtype, single_file: bool = Fa
 
     if single_file and Path(source).is_file():
         raise ModelError(f"{source} holds no text encoder; set backbone.text_weights to a T5 folder or hub id")
-    folder = Path(source)
-    split = not folder.is_dir() or (folder / "text_encoder").is_dir()
-    parts = ("tokenizer", "text_encoder") if split and "t5" not in folder.name else ("", "")
-    try:
-        tokenizer = AutoTokenizer.from_pretrained(source, subfolder=parts[0])
-        encoder = T5EncoderModel.from_pretrained(source, subfolder=parts[1], dtype=dtype)
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise ModelError(f"no T5 text encoder in {source!r} ({_first_line(error)}); {_ADVICE}") from error
+    held = find_folder(source)
+    if held is None:
+        # Its own name must tell: google/t5-v1_1-large is a repository of nothing else.
+        alone = "t5" in Path(source).name
+    else:
+        alone = (held / "config.json").is_file() and not (held / "text_encoder").is_dir()
+    tokens, network = ("", "") if alone else ("tokenizer", "text_encoder")
+    folder = _folder_with(source, str(Path(tokens, "tokenizer_config.json")), str(Path(network, "config.json")))
+    with _loading("a T5 text encoder", source):
+        tokenizer = AutoTokenizer.from_pretrained(folder, subfolder=tokens, local_files_only=True)
+        encoder = T5EncoderModel.from_pretrained(folder, subfolder=network, dtype=dtype, local_files_only=True)
     return tokenizer, encoder
 
 
@@ -70,10 +83,57 @@ def load_image_encoder(source: str, *, dtype: torch.dtype) -> torch.nn.Module:
     """
     from transformers import CLIPVisionModelWithProjection
 
+    part = "image_encoder"
+    folder = _folder_with(source, *(f"{part}/{name}" for name in _FILES))
+    with _loading("a CLIP image encoder", source):
+        return CLIPVisionModelWithProjection.from_pretrained(folder, subfolder=part, dtype=dtype, local_files_only=True)
+
+
+def find_folder(source: str) -> Path | None:
+    """A folder as it is, a hub id's folder in the hub's cache, where an earlier download left one; else None."""
+    if Path(source).is_dir():
+        return Path(source)
+    from huggingface_hub import snapshot_download
+
     try:
-        return CLIPVisionModelWithProjection.from_pretrained(source, subfolder="image_encoder", dtype=dtype)
+        return Path(snapshot_download(source, local_files_only=True))
+    except (OSError, ValueError):
+        return None
+
+
+def _folder_with(source: str, *wanted: str) -> Path:
+    """The folder of ``source``, which holds the files (glob patterns) that are wanted.
+
+    Raises:
+        ModelError: some of them are not there; they are named, and where they may lie.
+    """
+    folder = find_folder(source)
+    lacking = [one for one in wanted if folder is None or not any(folder.glob(one))]
+    if folder is not None and not lacking:
+        return folder
+    names = ", ".join(lacking)
+    if Path(source).is_dir():
+        raise ModelError(f"{source} lacks {names}; copy them there, or name another folder ({_WHERE})")
+    if not _HUB_ID.fullmatch(source):
+        raise ModelError(f"weights {source!r} are no folder and no file; name one that holds {names} ({_WHERE})")
+    from huggingface_hub import constants
+
+    parts = dict.fromkeys(one.rpartition("/")[0] for one in lacking)
+    chosen = "".join(f" --include '{part}/*'" for part in parts if part)
+    raise ModelError(
+        f"weights {source!r} are not on this machine, and nothing is downloaded: the hub's cache "
+        f"{constants.HF_HUB_CACHE} lacks {names} of them; put them there (`hf download {source}{chosen}`), or name a "
+        f"local folder that has them ({_WHERE})"
+    )
+
+
+@contextlib.contextmanager
+def _loading(what: str, source: str, advice: str = "name weights of that class") -> Iterator[None]:
+    """The libraries' errors as one line."""
+    try:
+        yield
     except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise ModelError(f"no CLIP image encoder in {source!r} ({_first_line(error)}); {_ADVICE}") from error
+        raise ModelError(f"{what} could not be loaded from {source!r} ({_first_line(error)}); {advice}") from error
 
 
 def tensor_bytes(tensors: Mapping[str, torch.Tensor], *, metadata: Mapping[str, str] | None = None) -> bytes:
