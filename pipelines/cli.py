@@ -323,3 +323,6 @@ def export_coco(
 
 
 app.add_typer(training_commands)
+
+if __name__ == "__main__":
+    main()

@@ -74,6 +74,15 @@ def test_help_names_every_command_and_loads_nothing_heavy():
     assert heavy == "[]"
 
 
+@pytest.mark.parametrize("module", ["pipelines", "pipelines.cli"])
+def test_python_runs_the_modules_as_the_command(module):
+    command = [sys.executable, "-m", module]
+    done = subprocess.run([*command, "--help"], capture_output=True, text=True)
+    assert done.returncode == 0 and f"Usage: python -m {module}" in done.stdout
+    wrong = subprocess.run([*command, "status", "nowhere"], capture_output=True, text=True)
+    assert wrong.returncode == 2 and wrong.stderr.startswith("error:")
+
+
 def test_status_of_a_finished_job(run, job):
     code, out, _ = run("status", job)
     assert code == 0 and f"next: animatic cache {job} --backbone ltx-2b  (2 clips packed, which `animatic insp" in out
