@@ -251,6 +251,19 @@ def test_the_vae_with_timestep_conditioning_decodes_the_same_for_a_seed() -> Non
     assert not np.array_equal(videos[0], videos[2])
 
 
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        ("nonsense", "'nonsense' is not known; give cpu, cuda"),
+        ("cuda:99", "'cuda:99' cannot be used on this machine.*give cpu"),
+        ("meta", "'meta' cannot be used"),
+    ],
+)
+def test_a_device_that_is_not_there_is_refused(device: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_backbone(backbone_config("tiny", picture=PICTURE), device=device)
+
+
 def write_ltx(folder: Path) -> None:
     """A tiny LTX repository, laid out as diffusers lays out the real one."""
     from training.tiny import tiny_text, tiny_transformer, tiny_vae
