@@ -1,6 +1,7 @@
 """The study: equal compute, exact scores, verdicts that say when they cannot know, and a smoke run of all of it."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,12 @@ def test_questions_ask_for_arms_that_exist_and_a_larger_budget_buys_more():
     assert plan_study(10).scale.seeds >= 3
     with pytest.raises(ConfigError, match="2 minutes"):
         plan_study(2)
+
+
+@pytest.mark.parametrize("minutes", [-5, 0, math.nan, math.inf])
+def test_a_budget_that_is_no_time_is_refused(minutes):
+    with pytest.raises(ConfigError, match=f"a budget of {minutes:g} minutes .*; give a number from 5 on"):
+        plan_study(minutes)
 
 
 def test_shape_videos_are_functions_of_seed_and_index_and_move():

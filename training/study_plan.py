@@ -5,6 +5,7 @@ gets the same number of tokens in training; an arm of two stages spends half on 
 numbers of steps by nominal costs, so that the same budget gives the same study on every machine.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -178,15 +179,16 @@ def plan_study(minutes: float = DEFAULT_MINUTES, *, quick: bool = False) -> Stud
     """How a budget is spent; ``quick`` is a smoke run of seconds that shows nothing.
 
     Raises:
-        ConfigError: fewer than five minutes.
+        ConfigError: fewer than five minutes, or no number.
     """
     if quick:
         scale = StudyScale(train_clips=2, val_clips=2, samples=2, seeds=1, sampling_steps=2, batch=2, rank=4)
         base = BasePlan(vae_videos=20, denoiser_steps=2, videos=2)
         return StudyPlan(minutes=0.3, scale=scale, base=base, detector_steps=2, pair_steps=2, arm_tokens=200)
-    if minutes < _LEAST_MINUTES:
+    if not _LEAST_MINUTES <= minutes < math.inf:
         raise ConfigError(
-            f"a budget of {minutes:g} minutes is spent before anything is learnt; give {_LEAST_MINUTES:g}"
+            f"a budget of {minutes:g} minutes cannot be spent on a study; give a number from {_LEAST_MINUTES:g} on "
+            "(less is gone before anything is learnt)"
         )
     scale = _scale(minutes)
     steps = {name: max(1, round(60 * minutes * SHARES[name] / COSTS_S[name])) for name in COSTS_S if name in SHARES}
