@@ -97,8 +97,10 @@ def hashed_share(*parts: object) -> float:
 
 def storage_error(error: OSError, path: Path) -> Exception:
     """``error`` as a ``StorageError`` if it is about the place and not about the program, else itself."""
-    if error.errno not in _STORAGE_ERRNOS:
-        return error
+    return _as_storage_error(error, path) if error.errno in _STORAGE_ERRNOS else error
+
+
+def _as_storage_error(error: OSError, path: Path) -> StorageError:
     what = error.strerror or str(error)
     advice = {
         errno.ENOSPC: "free some space and run the command again",
@@ -118,6 +120,19 @@ def storage_errors(path: Path) -> Any:
         if mapped is error:
             raise
         raise mapped from error
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it, where they are not there.
+
+    Raises:
+        StorageError: it cannot be made, whatever the operating system calls the reason: in /proc or on a lost mount
+            it says that there is no such file.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _as_storage_error(error, folder) from error
 
 
 def host_name() -> str:
@@ -145,7 +160,7 @@ class ReceiptLog:
         line = json.dumps(asdict(receipt), sort_keys=True, separators=(",", ":")) + "\n"
         with storage_errors(self._path):
             fresh = not self._path.exists()
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self._path.parent)
             with self._path.open("ab", buffering=0) as stream:
                 start = stream.seek(0, os.SEEK_END)
                 try:
@@ -220,8 +235,7 @@ def publish(staging: Path, job: Path, names: Sequence[str]) -> tuple[Output, ...
             os.fsync(stream.fileno())
         outputs.append(Output(path=name, size=staged.stat().st_size, sha256=sha256_file(staged)))
     for folder in {(job / name).parent for name in names}:
-        with storage_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     for name in names:
         with storage_errors(job / name):
             (staging / Path(name).name).replace(job / name)
@@ -248,7 +262,7 @@ def atomic_write(path: Path, data: bytes | Iterable[bytes]) -> None:
         StorageError: no space, or the folder cannot be written to.
     """
     with storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         temporary = path.with_name(f".{path.name}.{host_name()}-{os.getpid()}.tmp")
         try:
             with temporary.open("wb") as stream:

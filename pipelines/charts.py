@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from dataset.receipts import atomic_write, make_folder, storage_errors
 from labeling.errors import ConfigError
 
 CHARTS: dict[str, str] = {
@@ -127,9 +128,12 @@ def run_chart(name: str, *, out: Path, quick: bool = False) -> Chart:
 
     Raises:
         ConfigError: no chart has that name.
+        StorageError: ``out`` cannot be written to.
     """
     if name not in CHARTS:
         raise ConfigError(f"no chart is called {name!r}; choose one of {', '.join(CHARTS)}")
+    # Before the minutes are spent.
+    make_folder(out)
     chart: Chart = importlib.import_module(CHARTS[name]).chart(name, quick=quick)
     write_chart(chart, out)
     return chart
@@ -137,13 +141,14 @@ def run_chart(name: str, *, out: Path, quick: bool = False) -> Chart:
 
 def write_chart(chart: Chart, out: Path) -> None:
     """``chart-<stage>.json`` and ``chart-<stage>.png`` in the folder ``out``."""
-    out.mkdir(parents=True, exist_ok=True)
     tree = asdict(chart)
     for point in tree["points"]:
         point[chart.cost] = point.pop("ms_per_frame")
     text = json.dumps(tree, indent=1, ensure_ascii=False) + "\n"
-    (out / f"chart-{chart.stage}.json").write_text(text, encoding="utf-8")
-    draw_chart(chart, out / f"chart-{chart.stage}.png")
+    atomic_write(out / f"chart-{chart.stage}.json", text.encode())
+    picture = out / f"chart-{chart.stage}.png"
+    with storage_errors(picture):
+        draw_chart(chart, picture)
 
 
 def draw_chart(chart: Chart, path: Path) -> None:

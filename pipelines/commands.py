@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.markup import escape
 
-from dataset.receipts import Receipt, storage_errors
+from dataset.receipts import Receipt, make_folder
 from dataset.selection import read_selection
 from labeling.captions import read_caption_table
 from labeling.ego_import import FileClock
@@ -147,8 +147,7 @@ def prepare_job(
     check_models_folder(options.models)
     if check is not None:
         check(job)
-    with storage_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     job.save()
     return job
 

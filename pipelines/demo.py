@@ -19,12 +19,13 @@ from rich.table import Table
 
 from dataset.inspection import clip_record, contact_sheet, find_sample, summarize, write_contact_sheet
 from dataset.loader import Sample, ShardDataset
-from dataset.receipts import atomic_write, storage_errors
+from dataset.receipts import atomic_write, make_folder
 from dataset.street import Scenario, Street, StreetConfig, write_street_video
 from labeling.errors import DataError
 from labeling.video import read_frames
 from pipelines.commands import JobOptions, run_label
 from pipelines.console import duration, make_console
+from pipelines.engine import starting_workers
 from pipelines.report import (
     PageTable,
     Picture,
@@ -115,8 +116,7 @@ def write_streets(folder: Path, *, workers: int | None = None) -> list[Path]:
     Raises:
         StorageError: the folder cannot be written to.
     """
-    with storage_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     paths = {video_id: folder / f"{video_id}.mp4" for video_id in _STREETS}
     missing = [(video_id, path) for video_id, path in paths.items() if not path.is_file()]
     if not missing:
@@ -126,7 +126,7 @@ def write_streets(folder: Path, *, workers: int | None = None) -> list[Path]:
             _write_street(video_id, path)
     else:
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(max_workers=workers, mp_context=context) as pool:
+        with starting_workers(), ProcessPoolExecutor(max_workers=workers, mp_context=context) as pool:
             list(pool.map(_write_street, *zip(*missing, strict=True)))
     return list(paths.values())
 

@@ -20,13 +20,28 @@ from dataset.receipts import (
     ReceiptLog,
     worker_name,
 )
-from labeling.errors import StorageError
+from labeling.errors import ConfigError, StorageError
 from pipelines.items import Task, base_receipt, perform, sweep_staging
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _LEAST_FREE_BYTES = 1 << 20
 _DEATHS_ALLOWED = 2
 """A worker that dies is often just the one the system chose to kill; an item that kills two is at fault."""
+
+
+@contextlib.contextmanager
+def starting_workers() -> Iterator[None]:
+    """Say it where processes cannot start: a broken pipe is else taken for a reader of the output who has left.
+
+    Raises:
+        ConfigError: a process ended while it was being started.
+    """
+    try:
+        yield
+    except BrokenPipeError as error:
+        raise ConfigError(
+            "a worker ended while it was being started, for lack of memory most likely; give fewer --workers"
+        ) from error
 
 
 class Engine:
@@ -143,7 +158,7 @@ class _Worker:
         self.connection, other = context.Pipe()
         self.process = context.Process(target=_serve, args=(root, other, os.getpid()), daemon=True)
         self.task: Task | None = None
-        with _one_thread_each():
+        with _one_thread_each(), starting_workers():
             self.process.start()
         other.close()
 

@@ -17,10 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from dataset.loader import Sample, ShardDataset
-from dataset.receipts import atomic_write, digest, sha256_file, storage_errors
+from dataset.receipts import atomic_write, digest, make_folder, sha256_file, storage_errors
 from labeling.camera import read_tum, resample
 from labeling.errors import ConfigError
 from labeling.extractors import Extractors, choose_extractors
+from pipelines.engine import starting_workers
 from pipelines.evaluate_notes import clip_notes, record_notes, result_notes, ruler_notes
 from pipelines.evaluate_ruler import EvaluateOptions, Ruler, check_options, read_ruler
 from training.evaluation import ClipTruth, SampleEstimate, score_clip, too_short, with_fault
@@ -106,6 +107,7 @@ def evaluate(
     ruler = read_ruler(job, options)
     keys = [key for key in clips if key in folders[SAMPLES].by_key]
     out = options.out or samples / "evaluation"
+    make_folder(out)
     kept = _KeptClips(out / _KEPT)
     tasks = {}
     for key in keys:
@@ -152,12 +154,12 @@ def _worked(tasks: Mapping[str, _Task], *, workers: int) -> Iterator[tuple[str, 
     """Results as they come, by stamp; in this process where there is one worker or one clip.
 
     Raises:
-        ConfigError: a worker died.
+        ConfigError: a worker died, or none can start.
     """
     if min(workers, len(tasks)) < 2:
         yield from ((stamp, _evaluate_clip(task)) for stamp, task in list(tasks.items()))
         return
-    with ProcessPoolExecutor(min(workers, len(tasks)), mp_context=get_context("spawn")) as pool:
+    with starting_workers(), ProcessPoolExecutor(min(workers, len(tasks)), mp_context=get_context("spawn")) as pool:
         running = {pool.submit(_evaluate_clip, task): stamp for stamp, task in tasks.items()}
         try:
             for done in as_completed(running):
@@ -259,7 +261,7 @@ class _KeptClips:
     def add(self, stamp: str, result: ClipResult) -> None:
         line = json.dumps({"stamp": stamp, "result": finite_or_none(asdict(result))}, sort_keys=True)
         with storage_errors(self._path):
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self._path.parent)
             with self._path.open("a", encoding="utf-8") as stream:
                 stream.write(f"{self._torn}{line}\n")
         self._torn = ""

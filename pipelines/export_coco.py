@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dataset.receipts import atomic_write, storage_errors
+from dataset.receipts import atomic_write, make_folder, storage_errors
 from dataset.tables import read_keypoints
 from labeling.errors import ConfigError
 from labeling.labels import Keypoints
@@ -205,7 +205,7 @@ def _write_images(root: Path, run: CocoRun, out: Path) -> None:
             options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
             data = cv2.imencode(".jpg", picture[..., ::-1], options)[1].tobytes()
             with storage_errors(path):
-                path.parent.mkdir(parents=True, exist_ok=True)
+                make_folder(path.parent)
                 path.write_bytes(data)
 
 

@@ -14,9 +14,9 @@ from dataset.receipts import (
     ReceiptLog,
     digest,
     host_name,
+    make_folder,
     publish,
     storage_error,
-    storage_errors,
 )
 from labeling.errors import AnimaticError, StorageError
 from pipelines.stage import DroppedError, WorkItem, load_stage
@@ -62,8 +62,7 @@ def perform(root: Path, task: Task, log: ReceiptLog) -> Receipt:
 def _make(root: Path, task: Task, staging: Path, log: ReceiptLog) -> Receipt:
     item = task.item
     shutil.rmtree(staging, ignore_errors=True)
-    with storage_errors(staging):
-        staging.mkdir(parents=True)
+    make_folder(staging)
     facts = load_stage(item.stage).work(root, item, staging)
     base = base_receipt(task)
     if task.previous is not None and task.previous.outputs and task.previous.key != item.key:

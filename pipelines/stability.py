@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from dataset.receipts import atomic_write, make_folder, storage_errors
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
 from pipelines.reliability import ReliabilityCurve, draw_reliability
@@ -71,11 +72,14 @@ def run_stability(name: str, *, out: Path, quick: bool = False) -> StabilityTabl
 
     Raises:
         ConfigError: no table has that name.
+        StorageError: ``out`` cannot be written to.
     """
     if name not in STABILITY:
         raise ConfigError(
             f"no stability table is called {name!r}; choose one of {', '.join(STABILITY) or 'none so far'}"
         )
+    # Before the minutes are spent.
+    make_folder(out)
     table: StabilityTable = importlib.import_module(STABILITY[name]).stability(quick=quick)
     write_stability(table, out)
     return table
@@ -83,15 +87,15 @@ def run_stability(name: str, *, out: Path, quick: bool = False) -> StabilityTabl
 
 def write_stability(table: StabilityTable, out: Path) -> None:
     """``stability-<stage>.json`` in the folder ``out``, and where the table has curves ``reliability-<stage>.png``."""
-    out.mkdir(parents=True, exist_ok=True)
     values = asdict(table)
     if not table.curves:
         values.pop("curves")
     text = json.dumps(values, indent=1, ensure_ascii=False) + "\n"
-    (out / f"stability-{table.stage}.json").write_text(text, encoding="utf-8")
+    atomic_write(out / f"stability-{table.stage}.json", text.encode())
     if table.curves:
         picture = out / f"reliability-{table.stage}.png"
-        draw_reliability(table.curves, picture, title=f"{table.stage}: can scores be believed?", note=table.data)
+        with storage_errors(picture):
+            draw_reliability(table.curves, picture, title=f"{table.stage}: can scores be believed?", note=table.data)
 
 
 def make_table(stage: str, data: str, rows: Sequence[StabilityRow]) -> StabilityTable:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from labeling.errors import ConfigError
+from labeling.errors import ConfigError, StorageError
 from pipelines.charts import (
     Chart,
     ChartPoint,
@@ -51,6 +51,21 @@ def test_chart_files(tmp_path: Path) -> None:
     assert [p["method"] for p in stored["points"]] == [p.method for p in POINTS]
     picture = cv2.imread(str(tmp_path / "chart-ego.png"))
     assert picture is not None and picture.shape[1] == 1200
+
+
+@pytest.mark.parametrize("place", ["/proc/none", "file"], ids=["proc", "below a file"])
+def test_a_folder_that_cannot_be_made_is_said_before_anything_is_measured(tmp_path: Path, monkeypatch, place) -> None:
+    monkeypatch.setattr("importlib.import_module", lambda _: pytest.fail("it was measured"))
+    (tmp_path / "file").write_text("")
+    for measure, name in ((run_chart, "ego-video"), (run_stability, "ego")):
+        with pytest.raises(StorageError, match=f"{place}/x: .*; give a folder that can be written to"):
+            measure(name, out=tmp_path / place / "x")
+
+
+def test_a_picture_that_cannot_be_written_is_an_error_of_storage(tmp_path: Path) -> None:
+    (tmp_path / "chart-ego.png").mkdir()
+    with pytest.raises(StorageError, match=r"chart-ego\.png: is a directory"):
+        write_chart(Chart(stage="ego", data="a street", points=POINTS, machine="a machine"), tmp_path)
 
 
 def test_another_cost_goes_by_its_own_name(tmp_path: Path) -> None:

@@ -188,6 +188,18 @@ def test_clips_are_shared_out_and_a_dead_worker_is_an_error(workers: int, monkey
         dict(module._worked(tasks, workers=workers))
 
 
+def test_workers_that_cannot_start_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A broken pipe that got through would end the command with 1 and not a word, as ``animatic ... | head`` does."""
+    import pipelines.evaluate as module
+
+    def broken(*_: Any, **__: Any) -> ThreadPoolExecutor:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(module, "ProcessPoolExecutor", broken)
+    with pytest.raises(ConfigError, match="ended while it was being started.*fewer --workers"):
+        dict(module._worked({"s1": "a", "s2": "b"}, workers=2))  # type: ignore[dict-item]
+
+
 def test_imported_trajectories_and_asked_ones_and_true_skeletons(
     job: Path, clip: Sample, mixed: Path, tmp_path: Path
 ) -> None:

@@ -11,6 +11,7 @@ from dataset.receipts import (
     atomic_write,
     digest,
     hashed_share,
+    make_folder,
     outputs_present,
     publish,
     read_receipts,
@@ -92,6 +93,19 @@ def test_a_line_that_does_not_fit_is_taken_back(tmp_path, monkeypatch):
         log.append(receipt("b"))
     monkeypatch.undo()
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("place", ["/proc/none", "file"], ids=["proc", "below a file"])
+def test_a_folder_that_cannot_be_made_is_an_error_of_storage(tmp_path, place):
+    (tmp_path / "file").write_text("")
+    folder = tmp_path / place / "x"
+    for write in (
+        make_folder,
+        lambda path: atomic_write(path / "a", b""),
+        lambda job: ReceiptLog(job, "s").append(receipt()),
+    ):
+        with pytest.raises(StorageError, match=f"{place}.*; give a folder that can be written to"):
+            write(folder)
 
 
 def test_published_files_are_whole_and_hashed(tmp_path):

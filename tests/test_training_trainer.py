@@ -12,7 +12,7 @@ import torch
 from accelerate import Accelerator
 from training_fixtures import PICTURE, in_children, one_thread, tiny_config, tiny_job  # noqa: F401
 
-from labeling.errors import ConfigError, DataError
+from labeling.errors import ConfigError, DataError, StorageError
 from training.adapters import activate_adapter
 from training.backbones import load_backbone
 from training.batches import Draw, StepBatches, TrainingItems, collate
@@ -285,7 +285,6 @@ def test_the_checkpoint_just_written_is_never_pruned(tmp_path: Path, keep: int, 
 
 
 def test_a_save_that_fails_leaves_earlier_checkpoints_whole(tmp_path: Path, monkeypatch) -> None:
-    from labeling.errors import StorageError
     from training import checkpoints
 
     save_checkpoint(tmp_path, 1, {"a": b"1"}, keep=1)
@@ -397,6 +396,16 @@ def test_unknown_trackers_missing_latents_and_empty_splits_are_named(
     cache_latents(only_val, backbone_name="tiny", picture=PICTURE, datasets={"val": fake_datasets(0, 1)["val"]})
     with pytest.raises(DataError, match="no clips for training"):
         run(tiny_config("motion"), only_val, tmp_path / "out")
+
+
+@pytest.mark.parametrize("trackers", [[], ["tensorboard"]], ids=["metrics alone", "tensorboard"])
+def test_a_folder_that_cannot_be_written_to_is_named(trackers, tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    (tmp_path / "file").write_text("")
+    (tmp_path / "taken" / "metrics.jsonl").mkdir(parents=True)
+    (tmp_path / "taken" / "logs").write_text("")
+    for out in (Path("/proc/none"), tmp_path / "file" / "run", tmp_path / "taken"):
+        with pytest.raises(StorageError, match=f"{out}.*; give a folder that can be written to"):
+            run(tiny_config("motion", trackers=trackers), tiny_job, out)
 
 
 def test_order_covers_every_clip_each_epoch_and_is_shared_out_without_overlap() -> None:

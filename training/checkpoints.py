@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
-from dataset.receipts import storage_errors, sync_folder
+from dataset.receipts import make_folder, storage_errors, sync_folder
 from labeling.errors import DataError
 
 MANIFEST = "manifest.json"
@@ -40,7 +40,7 @@ def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes | dict[str,
     goal, staged = checkpoint_folder(root, step), root / f".step_{step:08d}.{os.getpid()}"
     with storage_errors(root):
         shutil.rmtree(staged, ignore_errors=True)
-        staged.mkdir(parents=True)
+        make_folder(staged)
         try:
             for name, data in files.items():
                 _write_synced(staged / name, data)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dataset.receipts import atomic_write, storage_errors
+from dataset.receipts import atomic_write, make_folder, storage_errors
 from labeling.camera import Intrinsics, Trajectory, write_tum
 from labeling.encoding import VideoWriter, lossless_rgb
 from labeling.errors import ConfigError
@@ -164,9 +164,10 @@ def write_samples(
 
     Raises:
         ConfigError: conditions that are missing or do not fit.
-        StorageError: no space left.
+        StorageError: no space left, or ``out`` cannot be written to.
     """
     settings, rate = settings or SamplingSettings(), generator.picture(generator.first_stage).rate
+    make_folder(out)
     with storage_errors(out):
         _take_away(out, name)
         if conditions.trajectory is not None:

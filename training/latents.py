@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dataset.receipts import digest, hashed_share, storage_errors, sync_folder
+from dataset.receipts import digest, hashed_share, make_folder, storage_errors, sync_folder
 from labeling.camera import Intrinsics
 from labeling.errors import ConfigError, DataError
 from labeling.skeleton_video import DEFAULT_STYLE
@@ -99,7 +99,7 @@ def cache_latents(
     Raises:
         ConfigError: frame counts or sizes that the backbone does not take, or sizes of another aspect than the clips'.
         DataError: a stale cache (both fingerprints are named), no clips.
-        StorageError: no space left.
+        StorageError: no space left, or the folder cannot be written to.
     """
     config = (
         backbone.config if backbone else backbone_config(backbone_name, **({"picture": picture} if picture else {}))
@@ -114,6 +114,7 @@ def cache_latents(
     manifest = plan_manifest(backbone, clip_frames=clip_frames, controls=controls, object_variants=object_variants)
     width, height = _picture_size(samples[0][1])
     check_aspect(config.picture, width=width, height=height)
+    make_folder(folder)
     with storage_errors(folder):
         _open_store(folder, manifest, refresh=refresh)
         mine = [(split, one) for split, one in samples if int(hashed_share("part", one.key) * part[1]) == part[0]]

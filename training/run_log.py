@@ -12,6 +12,8 @@ from accelerate import Accelerator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dataset.receipts import make_folder, storage_errors
+
 METRICS = "metrics.jsonl"
 
 
@@ -49,9 +51,10 @@ class RunLog:
         )  # fmt: skip
         self._task = self._progress.add_task("train", total=steps, completed=start, loss="-", rate="", memory="")
         if self._main:
-            out.mkdir(parents=True, exist_ok=True)
+            make_folder(out)
             kept = [line for line in self._lines() if json.loads(line)["step"] <= start]
-            self._path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+            with storage_errors(self._path):
+                self._path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
 
     def _lines(self) -> list[str]:
         return self._path.read_text(encoding="utf-8").split("\n")[:-1] if self._path.is_file() else []
@@ -80,10 +83,11 @@ class RunLog:
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """Numbers of a step, to the trackers and the file."""
-        self._accelerator.log(values, step=step)
-        if self._main:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"step": step, **values}, sort_keys=True) + "\n")
+        with storage_errors(self._path):
+            self._accelerator.log(values, step=step)
+            if self._main:
+                with self._path.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"step": step, **values}, sort_keys=True) + "\n")
 
 
 def read_metrics(out: Path) -> list[dict[str, Any]]:

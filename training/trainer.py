@@ -17,7 +17,7 @@ from accelerate.tracking import get_available_trackers
 from accelerate.utils import LoggerType
 from torch.utils.data import DataLoader
 
-from dataset.receipts import storage_errors
+from dataset.receipts import make_folder, storage_errors
 from labeling.errors import ConfigError, DataError
 from training.adapters import trainable_count
 from training.attachment import attach_for_training
@@ -89,6 +89,7 @@ def train(
     Raises:
         ConfigError: settings that contradict each other or the checkpoint.
         DataError: no latents, stale latents.
+        StorageError: no space left, or ``out`` cannot be written to.
         TrainingError: a loss that is no number, no memory left; the last good checkpoint is intact.
     """
     if dry_run:
@@ -189,7 +190,8 @@ class Trainer:
                     self._videos()
                 if on_step:
                     on_step(self.step, values["loss"])
-        self.accelerator.end_training()
+        with storage_errors(self.out):
+            self.accelerator.end_training()
         return TrainSummary(
             steps=self.step, started_at=start, losses=tuple(losses), held_out=held_out, adapter=self.out / ADAPTER,
             trainable=trainable_count(self.parameters), interrupted=stopping,
@@ -308,7 +310,10 @@ def _accelerator(config: TrainConfig, out: Path) -> Accelerator:
         cpu=not torch.cuda.is_available(),
     )  # fmt: skip
     if config.trackers:
-        accelerator.init_trackers("logs", config={"name": config.name, "stage": config.stage, "seed": config.seed})
+        if accelerator.is_main_process:
+            make_folder(out)
+        with storage_errors(out):
+            accelerator.init_trackers("logs", config={"name": config.name, "stage": config.stage, "seed": config.seed})
     return accelerator
 
 
