@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from labeling.ego_motion import EgoSettings
 from labeling.encoding import EncoderSettings, lossless_rgb
 from labeling.errors import ConfigError
+from labeling.settings_faults import settings_faults
 from labeling.timeline import ClipSettings
 
 Effort = Literal["fast", "balanced", "exact"]
@@ -214,19 +215,7 @@ def parse_settings(model: type[Model], values: Mapping[str, Any], name: str) -> 
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:
-        faults = "; ".join(_fault(model, fault) for fault in error.errors())
-        raise ConfigError(f"{name}: {faults}") from error
-
-
-def _fault(model: type[BaseModel], fault: Any) -> str:
-    place = ".".join(str(part) for part in fault["loc"]) or "settings"
-    if fault["type"] != "extra_forbidden":
-        return f"{place}: {fault['msg'].lower().removeprefix('value error, ')}, got {fault['input']!r}"
-    known: Any = model
-    for part in fault["loc"][:-1]:
-        known = known.model_fields[part].annotation if hasattr(known, "model_fields") else None
-    fields = ", ".join(known.model_fields) if hasattr(known, "model_fields") else "none"
-    return f"{place} is not a setting; choose one of {fields}"
+        raise ConfigError(f"{name}: {settings_faults(model, error)}") from error
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Recipes: the paper's numbers, unknown keys refused, the dry run's counts."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -36,16 +37,41 @@ def test_the_papers_recipe() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("backbone: tiny\noptimiser: {steps: 3, lerning_rate: 1}", "optimiser.lerning_rate: Extra inputs"),
-        ("backbone: tinny\noptimiser: {steps: 3}", "backbone"),
-        ("backbone: tiny\noptimiser: {steps: 0}", "optimiser.steps"),
-        ("backbone: tiny", "optimiser: Field required"),
+        (
+            "backbone: tiny\noptimiser: {steps: 3, lerning_rate: 1}",
+            "optimiser.lerning_rate is not a setting; choose one of learning_rate",
+        ),
+        ("backbone: tinny\noptimiser: {steps: 3}", "backbone: not a preset; choose one of tiny, .*'tinny'"),
+        ("backbone: tiny\noptimiser: {steps: 0}", "c.yaml: optimiser.steps is 0, but must be 1 or more$"),
+        ("backbone: tiny\noptimiser: {steps: three}", "optimiser.steps is 'three', but must be a whole number"),
+        (
+            "backbone: tiny\noptimiser: {steps: 3, schedule: cosin}",
+            "schedule is 'cosin', but must be 'cosine', 'linear",
+        ),
+        ("backbone: tiny\noptimiser: {steps: 3}\nconditions: {ego_probability: 2}", "is 2, but must be 1 or less"),
+        ("backbone: tiny\noptimiser: 3", "optimiser is 3, but must hold settings by name"),
+        ("backbone: tiny\noptimiser: {steps: 0}\nseed: x", "steps is 0, .*; seed is 'x', but must be a whole number$"),
+        ("backbone: tiny", "optimiser is missing"),
         ("stage: appearance\nbackbone: tiny\noptimiser: {steps: 3}", "trains stage 'appearance'"),
         ("backbone: tiny\noptimiser: {steps: 3}\nconditions: {coordinates: released}", "for sampling only"),
         ("a: [", "is not YAML"),
         ("- 1", "holds a list"),
     ],
-    ids=["unknown key", "unknown backbone", "no steps", "missing", "other stage", "released", "no yaml", "list"],
+    ids=[
+        "unknown key",
+        "unknown backbone",
+        "no steps",
+        "not whole",
+        "no choice",
+        "too much",
+        "no settings",
+        "two",
+        "missing",
+        "other stage",
+        "released",
+        "no yaml",
+        "list",
+    ],
 )
 def test_files_that_cannot_be_used_are_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "c.yaml"
@@ -59,7 +85,7 @@ def test_unknown_names_are_refused_with_what_there_is() -> None:
         load_config("motion_ltx_3b")
     with pytest.raises(ConfigError, match="ltx-13b"):
         backbone_config("ltx")
-    with pytest.raises(ConfigError, match="stage: Field required"):
+    with pytest.raises(ConfigError, match="stage is missing"):
         load_config("tiny")
 
 
@@ -119,3 +145,9 @@ def test_dry_run_memory_follows_the_knobs() -> None:
         {"optimiser": {"micro_batch": 2}}, {"gradient_checkpointing": False}, {"adapter": {"rank": 1024}},
     ):  # fmt: skip
         assert plan_run(load_config("motion_ltx_2b", overrides=overrides)).memory_gib > plain.memory_gib
+
+
+@pytest.mark.parametrize("rate", [-1, 0, math.nan, math.inf])
+def test_a_rate_that_is_none_is_refused(rate: float) -> None:
+    with pytest.raises(ConfigError, match=f"--steps-per-second {rate:g} is no rate of steps"):
+        plan_run(load_config("tiny", stage="motion"), steps_per_second=rate)

@@ -13,6 +13,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from labeling.errors import ConfigError
+from labeling.settings_faults import settings_faults
 
 Stage = Literal["motion", "appearance", "end_to_end"]
 STAGES: tuple[Stage, ...] = ("motion", "appearance", "end_to_end")
@@ -93,6 +94,8 @@ class BackboneConfig(_Settings):
             value = {"name": value}
         if isinstance(value, Mapping) and "kind" not in value and value.get("name") in BACKBONES:
             return _merged(BACKBONES[value["name"]] | {"name": value["name"]}, value)
+        if isinstance(value, Mapping) and "kind" not in value and "name" in value:
+            raise ValueError(f"not a preset; choose one of {', '.join(BACKBONES)}, or say its kind")
         return value
 
 
@@ -314,5 +317,4 @@ def _validated(model: type[Model], tree: Mapping[str, Any], label: str) -> Model
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'config'}: {e['msg']}" for e in error.errors())
-        raise ConfigError(f"{label}: {wrong}") from error
+        raise ConfigError(f"{label}: {settings_faults(model, error)}") from error

@@ -86,8 +86,13 @@ def plan_run(config: TrainConfig, *, steps_per_second: float | None = None) -> R
     """The plan of a recipe; loads nothing.
 
     Raises:
-        ConfigError: frame counts or sizes that the backbone does not take, or weights whose size is not told.
+        ConfigError: frame counts or sizes that the backbone does not take, weights whose size is not told, or a rate
+            that is none.
     """
+    if steps_per_second is not None and not 0 < steps_per_second < math.inf:
+        raise ConfigError(
+            f"--steps-per-second {steps_per_second:g} is no rate of steps; give a number above 0, such as 0.5"
+        )
     denoiser, geometry, hidden, layers = _meta_network(config)
     base = sum(weight.numel() for weight in denoiser.parameters())
     trainable = lora_parameters(denoiser, config.adapter.targets, rank=config.adapter.rank)
@@ -109,7 +114,7 @@ def plan_run(config: TrainConfig, *, steps_per_second: float | None = None) -> R
         steps=optimiser.steps, global_batch=optimiser.global_batch,
         samples=optimiser.steps * optimiser.global_batch,
         petaflops_per_step=optimiser.global_batch * work / 1e15,
-        hours=optimiser.steps / steps_per_second / 3600 if steps_per_second else None,
+        hours=optimiser.steps / steps_per_second / 3600 if steps_per_second is not None else None,
     )  # fmt: skip
 
 

@@ -1,0 +1,46 @@
+"""What is wrong with settings, in words: the field, the value, and what is allowed."""
+
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+_ALLOWED = {
+    "greater_than": "be above {gt:g}", "greater_than_equal": "be {ge:g} or more", "less_than": "be below {lt:g}",
+    "less_than_equal": "be {le:g} or less", "literal_error": "be {expected}", "finite_number": "be finite",
+    "int_type": "be a whole number", "int_parsing": "be a whole number", "int_from_float": "be a whole number",
+    "float_type": "be a number", "float_parsing": "be a number", "bool_type": "be true or false",
+    "bool_parsing": "be true or false", "string_type": "be text", "tuple_type": "be a list", "list_type": "be a list",
+    "model_type": "hold settings by name", "model_attributes_type": "hold settings by name",
+    "dict_type": "hold values by name",
+}  # fmt: skip
+"""By pydantic's types of errors."""
+
+
+def settings_faults(model: type[BaseModel], error: ValidationError) -> str:
+    """Every wrong field of settings, with semicolons between them.
+
+    Args:
+        model: what the settings should have been.
+        error: what pydantic says of them.
+    """
+    return "; ".join(_fault(model, fault) for fault in error.errors())
+
+
+def _fault(model: type[BaseModel], fault: Any) -> str:
+    place, kind = ".".join(str(part) for part in fault["loc"]) or "settings", fault["type"]
+    if kind == "extra_forbidden":
+        return f"{place} is not a setting; choose one of {_neighbours(model, fault['loc'])}"
+    if kind == "missing":
+        return f"{place} is missing; it has no default, so give it"
+    if kind in _ALLOWED:
+        return f"{place} is {fault['input']!r}, but must {_ALLOWED[kind].format(**fault.get('ctx', {}))}"
+    return f"{place}: {fault['msg'].lower().removeprefix('value error, ')}, got {fault['input']!r}"
+
+
+def _neighbours(model: type[BaseModel], place: tuple[int | str, ...]) -> str:
+    """The fields that there are where an unknown one was given."""
+    known: Any = model
+    for part in place[:-1]:
+        fields = getattr(known, "model_fields", {})
+        known = fields[part].annotation if part in fields else None
+    return ", ".join(getattr(known, "model_fields", ())) or "none"
