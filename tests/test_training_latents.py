@@ -1,8 +1,11 @@
 """Latents: fingerprinted, resumable, by part, from labels and not from decoded skeletons."""
 
+import json
 import shutil
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -138,8 +141,89 @@ def test_a_damaged_clip_and_a_changed_source_are_made_anew(tmp_path: Path, backb
     store = LatentStore(tmp_path / "latents" / "tiny")
     (store.folder / store.record("street_0").file).write_bytes(b"short")
     assert cache(tmp_path, backbone, **few).made == 1
-    monkeypatch.setattr(module, "_source_digest", lambda sample: f"new {sample.key}")
+    monkeypatch.setattr(module, "_encoded_digest", lambda sample, controls: f"new {sample.key}")
     assert cache(tmp_path, backbone, **few).made == 2
+
+
+@dataclass
+class PackedSample(FakeSample):
+    """A fake clip that names the bytes of its members, as clips of shards do."""
+
+    changed: str = ""
+    """The member that is other than it was."""
+
+    @property
+    def members(self) -> dict[str, Any]:
+        names = ("rgb.mp4", "skeleton.mp4", "ego.mp4", "labels.parquet", "cam_to_world.npy", "txt", "json")
+        return {name: SimpleNamespace(sha256=f"{self.key} {name} {name == self.changed}") for name in names}
+
+    @property
+    def caption(self) -> str:
+        return "A road, told anew." if self.changed == "txt" else super().caption
+
+
+@pytest.mark.parametrize(
+    ("changed", "made"),
+    [("txt", 0), ("json", 0), ("skeleton.mp4", 0), ("rgb.mp4", 1), ("labels.parquet", 1), ("cam_to_world.npy", 1)],
+)
+def test_latents_are_made_anew_where_what_they_are_made_of_has_changed(
+    tmp_path: Path, backbone, changed: str, made: int
+) -> None:
+    def digests() -> list[str]:
+        store = LatentStore(tmp_path / "latents" / "tiny")
+        assert torch.equal(
+            store.text(store.record("a_0").caption).tokens_LD,
+            backbone.encode_text([store.record("a_0").caption])[0].tokens_LD,
+        )
+        return [store.data_digest("train"), store.record("a_0").caption]
+
+    before = {"train": [PackedSample(key="a_0"), PackedSample(key="b_0")]}
+    after = {"train": [PackedSample(key="a_0", changed=changed), PackedSample(key="b_0")]}
+    cache(tmp_path, backbone, datasets=before)
+    data, caption = digests()
+    assert cache(tmp_path, backbone, datasets=after).made == made
+    assert digests()[0] != data, "a run on the clips as they were is refused"
+    assert (digests()[1] != caption) == (changed == "txt")
+    assert cache(tmp_path, backbone, datasets=after).made == 0
+    assert cache(tmp_path, backbone, datasets=before).made == made
+    assert digests() == [data, caption]
+
+
+def test_latents_of_an_older_version_stay_while_nothing_has_changed(tmp_path: Path, backbone) -> None:
+    folder = tmp_path / "latents" / "tiny"
+
+    def as_older_versions_wrote() -> None:
+        (log,) = folder.glob("clips-*.jsonl")
+        records = [json.loads(line) for line in log.read_text().splitlines()]
+        lines = [{name: value for name, value in record.items() if name != "encoded"} for record in records]
+        log.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+
+    told = {"train": [PackedSample(key="a_0")]}
+    cache(tmp_path, backbone, datasets=told)
+    data = LatentStore(folder).data_digest("train")
+    as_older_versions_wrote()
+    assert cache(tmp_path, backbone, datasets=told).made == 0
+    assert LatentStore(folder).data_digest("train") == data
+    again = {"train": [PackedSample(key="a_0", changed="txt")]}
+    assert cache(tmp_path, backbone, datasets=again).made == 0, "what they are made of is known by now"
+    as_older_versions_wrote()
+    assert cache(tmp_path, backbone, datasets=told).made == 1, "nothing tells what had changed"
+
+
+def test_latents_that_a_kill_left_without_their_record_are_made_anew(tmp_path: Path, backbone, monkeypatch) -> None:
+    before, after = ({"train": [PackedSample(key="a_0", changed=name)]} for name in ("", "rgb.mp4"))
+    cache(tmp_path, backbone, datasets=before)
+    write = module._write_clip
+
+    def killed(*arguments: Any) -> None:
+        write(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "_write_clip", killed)
+    with pytest.raises(KeyboardInterrupt):
+        cache(tmp_path, backbone, datasets=after)
+    monkeypatch.undo()
+    assert cache(tmp_path, backbone, datasets=before).made == 1
 
 
 def test_captions_are_encoded_once_each(tmp_path: Path, backbone, monkeypatch) -> None:

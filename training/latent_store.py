@@ -37,7 +37,9 @@ class ClipRecord:
     size: int
     """Bytes."""
     source: str
-    """sha256 over what the clip was made from."""
+    """sha256 over all that the clip is made of, its caption too."""
+    encoded: str = ""
+    """sha256 over what the latents are made of; empty where an older version wrote the record."""
     object_variants: int = 1
     turn: int = 0
     """Counts a clip's records over all parts: the one with the highest turn holds."""

@@ -2,8 +2,9 @@
 
 Skeletons are rasterised afresh from keypoints and object and ego videos from tracks and trajectories, since a decoded
 4:2:0 video has lost their colours; only RGB (and controls that have no labels) are decoded. The mask for targeted noise
-comes from the same keypoints. A clip is done when its line is in the part's log; a killed job goes on from there. Clips
-that left the shards are retired: every part says so in its own log, so that no host waits for another.
+comes from the same keypoints. A clip is done when its line is in the part's log; a killed job goes on from there. Where
+its caption or its choice alone has changed, it gets another line, and its latents stay. Clips that left the shards are
+retired: every part says so in its own log, so that no host waits for another.
 """
 
 import os
@@ -176,20 +177,26 @@ def _cache_part(
     made, total_bytes, captions = 0, 0, {""}
     _cache_texts(folder, [""], backbone)
     for done, (split, sample) in enumerate(samples, start=1):
-        source = _source_digest(sample)
-        record = held.get(sample.key)
-        turn = record.turn + 1 if record else 1
-        if not (record and _is_whole(folder, record, source=source)):
+        told = _told(sample, split, controls)
+        known = held.get(sample.key)
+        if known is not None and _is_whole(folder, known, told):
+            # Its latents are the same in either split, under another caption, and when it comes back.
+            record = replace(known, **told)
+        else:
+            if known is not None:
+                # A kill must not leave the new latents under a record that tells what the old ones were made of.
+                known = replace(known, source="", encoded="", retired=True, turn=known.turn + 1)
+                _append_line(log, known.line())
             tensors = encode_clip(sample, backbone, manifest, controls=controls, object_variants=object_variants)
-            made_now = _write_clip(folder, tensors, sample, split=split, source=source, object_variants=object_variants)
-            record = replace(made_now, turn=turn)
+            file, size = _write_clip(folder, tensors, sample)
+            record = ClipRecord(
+                key=sample.key, file=file, size=size, object_variants=object_variants, turn=known.turn if known else 0,
+                **told,
+            )  # fmt: skip
             made += 1
-            _cache_texts(folder, [record.caption], backbone)
-            _append_line(log, record.line())
-        elif (record.split, record.retired) != (split, False):
-            # Its latents are the same in either split, and when it comes back.
-            record = replace(record, split=split, retired=False, turn=turn)
-            _append_line(log, record.line())
+        _cache_texts(folder, [record.caption], backbone)
+        if record != known:
+            _append_line(log, replace(record, turn=record.turn + 1).line())
         captions.add(record.caption)
         total_bytes += record.size
         if progress:
@@ -251,28 +258,43 @@ def _videos(
         yield name, views.control(name)
 
 
+def _told(sample: Any, split: str, controls: Sequence[str]) -> dict[str, Any]:
+    """What a clip's record tells of the clip as it is now."""
+    return {
+        "split": split, "caption": sample.caption, "retired": False, "source": _source_digest(sample),
+        "encoded": _encoded_digest(sample, controls),
+    }  # fmt: skip
+
+
 def _source_digest(sample: Any) -> str:
     members = getattr(sample, "members", None)
     return digest({suffix: member.sha256 for suffix, member in members.items()} if members else sample.key)
 
 
-def _is_whole(folder: Path, record: ClipRecord, *, source: str) -> bool:
+def _encoded_digest(sample: Any, controls: Sequence[str]) -> str:
+    """Over what ``encode_clip`` reads of a clip, and no more: its caption and the rest of its record may change."""
+    members = getattr(sample, "members", None)
+    if not members:
+        return digest(sample.key)
+    names = ["rgb.mp4", "labels.parquet", "cam_to_world.npy", *(f"{name}.mp4" for name in sorted(controls))]
+    read = {name: members[name].sha256 for name in names if name in members}
+    return digest([read, sample.meta.get("intrinsics"), _picture_size(sample)])
+
+
+def _is_whole(folder: Path, record: ClipRecord, told: Mapping[str, Any]) -> bool:
+    """Whether a clip's latents are there, and made of what they would be made of now."""
     path = folder / record.file
-    whole = path.is_file() and path.stat().st_size == record.size
-    return record.source == source and whole and text_path(folder, record.caption).is_file()
+    # Records of older versions tell only what the whole clip was.
+    name = "encoded" if record.encoded else "source"
+    return getattr(record, name) == told[name] and path.is_file() and path.stat().st_size == record.size
 
 
-def _write_clip(
-    folder: Path, tensors: Mapping[str, torch.Tensor], sample: ClipSample, *, split: str, source: str,
-    object_variants: int,
-) -> ClipRecord:  # fmt: skip
+def _write_clip(folder: Path, tensors: Mapping[str, torch.Tensor], sample: ClipSample) -> tuple[str, int]:
+    """The clip's file, relative to the store's folder, and its bytes."""
     path = folder / "clips" / sample.key.rpartition("_")[0] / f"{sample.key}.safetensors"
     data = tensor_bytes(tensors, metadata={"key": sample.key})
     write_whole(path, data)
-    return ClipRecord(
-        key=sample.key, split=split, caption=sample.caption, file=str(path.relative_to(folder)), size=len(data),
-        source=source, object_variants=object_variants,
-    )  # fmt: skip
+    return str(path.relative_to(folder)), len(data)
 
 
 def _cache_texts(folder: Path, captions: Sequence[str], backbone: Backbone) -> None:
