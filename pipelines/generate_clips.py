@@ -13,16 +13,22 @@ from typing import Any
 import numpy as np
 
 from dataset.loader import Sample, ShardDataset
-from dataset.receipts import sha256_file
 from labeling.errors import ConfigError, DataError
 from labeling.object_video import object_frames
 from labeling.skeleton_video import draw_skeletons
 from labeling.timeline import Span
 from pipelines.console import counted, counting_bar, make_console
-from pipelines.train import GenerateOptions, check_start, clip_conditions
+from pipelines.train import GenerateOptions, check_start, clip_conditions, sample_facts
 from training.backbone import SamplingSettings
 from training.config import PictureConfig
-from training.generation import ClipGenerator, open_generator, prepare_conditions, sampling_record, write_samples
+from training.generation import (
+    ClipGenerator,
+    adapter_hashes,
+    open_generator,
+    prepare_conditions,
+    sampling_record,
+    write_samples,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +57,7 @@ def chosen_clips(job: Path, clips: str) -> list[Sample]:
     if clips in (*datasets, "all"):
         found = [sample for split, dataset in datasets.items() if clips in (split, "all") for sample in dataset]
         if not found:
-            raise DataError(f"{job}: has no clip in {clips}; `animatic inspect {job}` says what there is")
+            raise DataError(_empty_split(job, clips, {split: len(dataset) for split, dataset in datasets.items()}))
         return found
     by_key = {sample.key: sample for dataset in datasets.values() for sample in dataset}
     wanted = dict.fromkeys(key.strip() for key in clips.split(","))
@@ -60,6 +66,17 @@ def chosen_clips(job: Path, clips: str) -> list[Sample]:
         near = ", ".join(list(by_key)[:3]) or "none"
         raise DataError(f"{job}: has no clip {unknown[0]!r}; give val, train, all, or keys such as {near}")
     return [by_key[key] for key in wanted]
+
+
+def _empty_split(job: Path, clips: str, counts: Mapping[str, int]) -> str:
+    """Why ``--clips`` names nothing: whole source videos go to a split, and few of them may leave one empty."""
+    there = [f"{split} has {count}" for split, count in counts.items() if count]
+    if not there:
+        return f"{job}: has no clip at all; `animatic status {job}` says what was dropped and why"
+    return (
+        f"{job}: has no clip in {clips} ({there[0]}): the split is by source video, and the job has too few of them "
+        f"for {clips}; give --clips all, or label the videos again with --split FILE that names some for {clips}"
+    )
 
 
 def show_clips(
@@ -112,7 +129,7 @@ def generate_clips(
     settings = SamplingSettings(steps=options.steps, guidance=options.guidance, coordinates=options.coordinates)
     samples = chosen_clips(job, request.clips)
     generator = open_generator(options.backbone, **adapters, frames=options.frames, device=options.device)
-    hashes = {stage: _adapter_hash(path) for stage, path in sorted(adapters.items())}
+    hashes = adapter_hashes(generator)
     made = 0
     for number, sample in enumerate(samples):
         made += _make(generator, sample, request, out=out, options=options, settings=settings, adapters=hashes)
@@ -134,10 +151,9 @@ def _make(
 ) -> bool:  # fmt: skip
     """Make one clip's samples; False where they were there."""
     caption = request.caption or sample.caption
-    about = {
-        "adapters": dict(adapters), "ego": _told_ego(request.ego), "true_skeletons": request.true_skeletons,
-        "object_variant": request.object_variant, "clip": {name: row.sha256 for name, row in sample.members.items()},
-    }  # fmt: skip
+    about = {"adapters": dict(adapters)} | sample_facts(
+        sample, ego=request.ego, true_skeletons=request.true_skeletons, object_variant=request.object_variant
+    )
     record = sampling_record(generator, caption, samples=options.samples, seed=options.seed, settings=settings)
     if _is_there(out, sample.key, {**record, **about}, options.samples, rgb=set(adapters) != {"motion"}):
         return False
@@ -183,17 +199,6 @@ def _objects(sample: Sample, picture: PictureConfig, count: int, variant: int) -
         label_height=size["height"],
     )  # fmt: skip
     return np.stack(list(frames)[:: picture.frame_step])
-
-
-def _told_ego(ego: str | None) -> str | dict[str, str]:
-    """The trajectory as a record tells it: words as they are, a file by its content, which may change."""
-    if ego is None:
-        return "the clip's own"
-    return {"file": Path(ego).name, "sha256": sha256_file(Path(ego))} if Path(ego).is_file() else ego
-
-
-def _adapter_hash(path: Path) -> str:
-    return sha256_file(path / "adapter.safetensors" if path.is_dir() else path)
 
 
 def _is_there(out: Path, key: str, record: dict[str, Any], samples: int, *, rgb: bool) -> bool:

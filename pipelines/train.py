@@ -11,6 +11,7 @@ from rich.table import Table
 
 from dataset.inspection import find_sample
 from dataset.loader import Sample
+from dataset.receipts import sha256_file
 from labeling.camera import Intrinsics, rebased_trajectory
 from labeling.errors import ConfigError
 from pipelines.console import counted, counting_bar, file_size, make_console
@@ -127,8 +128,8 @@ def run_generate(
     """
     options = options or GenerateOptions()
     check_start(data=data, clip=clip, image=image, skeleton=skeleton)
-    if data is not None:
-        sample = find_sample(data, clip)
+    sample = None if data is None else find_sample(data, clip)
+    if sample is not None:
         conditions = clip_conditions(sample, with_ego=ego is None)
     elif image is not None and caption is not None:
         conditions = {"image": image, "caption": caption, "skeleton": skeleton, "name": image.stem}
@@ -138,8 +139,12 @@ def run_generate(
         conditions["caption"] = caption
     if ego is not None:
         conditions["ego"] = ego
+    given = {
+        "image": image, "skeleton": skeleton, "skeleton_video": options.skeleton_video, "objects": options.objects,
+    }  # fmt: skip
     files = generate(
-        **conditions, out=out, motion=motion, appearance=appearance, end_to_end=end_to_end,
+        **conditions, about=sample_facts(sample, ego=ego, files=given),
+        out=out, motion=motion, appearance=appearance, end_to_end=end_to_end,
         backbone=options.backbone, skeleton_video=options.skeleton_video, objects=options.objects,
         samples=options.samples, seed=options.seed, steps=options.steps, guidance=options.guidance,
         coordinates=options.coordinates, frames=options.frames, extractors=options.extractors,
@@ -149,6 +154,35 @@ def run_generate(
     for made in files:
         console.print(" ".join(str(path) for path in (made.control, made.rgb) if path is not None))
     return files
+
+
+def sample_facts(
+    clip: Sample | None, *, ego: str | None, true_skeletons: bool = False, object_variant: int | None = None,
+    files: Mapping[str, Path | None] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """What samples are made of, as their record tells it beside the adapters and the sampler's settings.
+
+    Args:
+        clip: of the job, or None where a picture is the start.
+        ego: as it was given.
+        true_skeletons: whether the clip's own skeletons are painted over.
+        object_variant: the clip's object video that is given.
+        files: given in place of the clip's own views.
+    """
+    facts: dict[str, Any] = {
+        "ego": _told(ego) if ego is not None or clip is None else "the clip's own", "true_skeletons": true_skeletons,
+        "object_variant": object_variant,
+        "clip": {name: row.sha256 for name, row in clip.members.items()} if clip is not None else None,
+    }  # fmt: skip
+    told = {name: _told(path) for name, path in (files or {}).items() if path is not None}
+    return facts | ({"files": told} if told else {})
+
+
+def _told(given: str | Path | None) -> str | dict[str, str] | None:
+    """Words as they are, a file by its content, which may change."""
+    if given is not None and Path(given).is_file():
+        return {"file": Path(given).name, "sha256": sha256_file(Path(given))}
+    return None if given is None else str(given)
 
 
 def check_start(

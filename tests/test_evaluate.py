@@ -358,7 +358,10 @@ def test_clips_are_chosen_by_split_or_key(job: Path) -> None:
         [one.key for one in chosen_clips(job, "val")] == [one.key for one in chosen_clips(job, "all")] == ["avenue_0"]
     )
     assert [one.key for one in chosen_clips(job, "avenue_0")] == ["avenue_0"]
-    for clips, words in (("train", "has no clip in train"), ("avenue_0,b_0", "has no clip 'b_0'")):
+    for clips, words in (
+        ("train", r"has no clip in train \(val has 1\): .* --clips all"),
+        ("avenue_0,b_0", "has no clip 'b_0'"),
+    ):
         with pytest.raises(DataError, match=words):
             chosen_clips(job, clips)
 
@@ -388,7 +391,7 @@ def adapters(job: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
 
 
 def test_what_generate_writes_is_what_evaluate_reads(job: Path, adapters: dict[str, Path], tmp_path: Path) -> None:
-    from pipelines.train import GenerateOptions
+    from pipelines.train import GenerateOptions, run_generate
 
     options = GenerateOptions(samples=2, steps=1)
     request = ClipsRequest(clips="val", ego="left 30deg", object_variant=0)
@@ -408,6 +411,9 @@ def test_what_generate_writes_is_what_evaluate_reads(job: Path, adapters: dict[s
     assert (tmp_path / "s/conditions/avenue_0.tum").is_file()
     record = json.loads((tmp_path / "s/avenue_0.json").read_text())
     assert (record["ego"], record["object_variant"], record["true_skeletons"]) == ("left 30deg", 0, False)
+    run_generate(out=tmp_path / "o", **adapters, data=job, clip="avenue_0", ego="left 30deg", options=options)  # type: ignore[arg-type]
+    alone = json.loads((tmp_path / "o/avenue_0.json").read_text())
+    assert alone == record | {"object_variant": None}, "the record of one clip tells what those of many tell"
 
 
 def test_options_of_one_clip_are_refused_for_many(job: Path, adapters: dict[str, Path], tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The two-stage generator: conditions, seeds, hand-over of latents, recipes for ego-motion, clear answers."""
 
+import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from training_fixtures import (  # noqa: F401
     walker,
 )
 
+from dataset.receipts import sha256_file
 from dataset.tables import write_keypoints
 from labeling.camera import prior_intrinsics, rebased_trajectory, rotation_angle_deg, write_tum
 from labeling.errors import ConfigError, DataError, ModelError
@@ -303,6 +305,29 @@ def test_a_clip_is_made_again_when_the_trajectory_file_changes(generator, tmp_pa
         return _make(generator, sample, request, out=tmp_path / "o", options=options, settings=settings, adapters={})
 
     assert [made(speed) for speed in (0.1, 0.1, 2.0, 2.0)] == [True, False, True, False]
+
+
+def test_the_record_of_one_clip_tells_what_it_was_made_of(adapters, tmp_path: Path) -> None:
+    for name, picture in (("first", IMAGE), ("skeleton", SKELETON)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), picture[..., ::-1])
+    run_generate(
+        out=tmp_path / "o", **two_stages(adapters), image=tmp_path / "first.png", skeleton=tmp_path / "skeleton.png",
+        caption="x", ego="left 30deg", options=GenerateOptions(steps=1, guidance=1.0),
+    )  # fmt: skip
+    record = json.loads((tmp_path / "o" / "first.json").read_text())
+    hashes = {stage: sha256_file(path) for stage, path in two_stages(adapters).items()}
+    assert (record["adapters"], record["ego"], record["clip"]) == (hashes, "left 30deg", None)
+    assert record["files"]["image"] == {"file": "first.png", "sha256": sha256_file(tmp_path / "first.png")}
+    assert sorted(record["files"]) == ["image", "skeleton"]
+
+
+def test_no_extractor_for_the_first_skeleton_is_said_before_anything_is_loaded(
+    adapters, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setenv("ANIMATIC_MODELS", str(tmp_path))
+    monkeypatch.setattr("training.generation.load_backbone", lambda *_, **__: pytest.fail("it was loaded"))
+    with pytest.raises(ConfigError, match=r"no extractors to find the first skeleton.*--models DIR"):
+        generate(image=IMAGE, caption="x", out=tmp_path, **two_stages(adapters))
 
 
 def test_videos_have_the_adapters_frame_rate_whatever_the_backbone_says(tmp_path: Path) -> None:

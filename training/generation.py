@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dataset.receipts import atomic_write, make_folder, storage_errors
+from dataset.receipts import atomic_write, make_folder, sha256_file, storage_errors
 from labeling.camera import Intrinsics, Trajectory, write_tum
 from labeling.encoding import VideoWriter, lossless_rgb
 from labeling.errors import ConfigError
@@ -31,6 +31,7 @@ from training.sampling_inputs import (
     first_skeleton,
     object_clip,
     read_image,
+    skeleton_extractors,
 )
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "ClipGenerator",
     "GeneratedClip",
     "GeneratedFiles",
+    "adapter_hashes",
     "generate",
     "open_generator",
     "prepare_conditions",
@@ -81,6 +83,7 @@ def generate(
     extractors: Sequence[str] | None = None,
     models_dir: Path | None = None,
     device: str | None = None,
+    about: Mapping[str, Any] | None = None,
 ) -> list[GeneratedFiles]:
     """Generate clips and write them: ``<out>/<name>_<n>.mp4`` (RGB) and ``<out>/skeleton/<name>_<n>.mp4``.
 
@@ -107,6 +110,7 @@ def generate(
         extractors: model cards for the first skeleton.
         models_dir: where their weights lie.
         device: ``cuda`` if there is one, else ``cpu``.
+        about: further entries of the record ``<name>.json``, beside the adapters' hashes.
 
     Raises:
         ConfigError: conditions that are missing or do not fit.
@@ -115,6 +119,8 @@ def generate(
     """
     # Checked before anything is loaded.
     settings = SamplingSettings(steps=steps, guidance=guidance, coordinates=coordinates)
+    if motion is not None and skeleton is None and skeleton_video is None:
+        skeleton_extractors(extractors, models_dir=models_dir)
     generator = open_generator(
         backbone, motion=motion, appearance=appearance, end_to_end=end_to_end, frames=frames, device=device
     )
@@ -124,7 +130,7 @@ def generate(
     )  # fmt: skip
     return write_samples(
         generator, conditions, out=out, name=name or (image.stem if isinstance(image, Path) else "sample"),
-        samples=samples, seed=seed, settings=settings,
+        samples=samples, seed=seed, settings=settings, about={"adapters": adapter_hashes(generator), **(about or {})},
     )  # fmt: skip
 
 
@@ -208,6 +214,16 @@ def sampling_record(
         "backbone": generator.backbone.config.model_dump(mode="json"), "frames": generator.frame_count,
         "frame_step": generator.picture(generator.first_stage).frame_step,
     }  # fmt: skip
+
+
+def adapter_hashes(generator: ClipGenerator) -> dict[str, str]:
+    """sha256 of each stage's adapter file."""
+    given = {"appearance": generator.appearance, "end_to_end": generator.end_to_end, "motion": generator.motion}
+    return {
+        stage: sha256_file(path / "adapter.safetensors" if path.is_dir() else path)
+        for stage, path in given.items()
+        if path is not None
+    }
 
 
 def prepare_conditions(

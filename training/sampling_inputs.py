@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -18,6 +19,9 @@ from labeling.timeline import Span
 from labeling.video import read_frames
 from training.config import PictureConfig
 from training.ego_recipes import recipe_trajectory
+
+if TYPE_CHECKING:
+    from labeling.extractors import ExtractorChoice
 
 LABEL_WIDTH = 1056
 """Extractors look at pictures this wide, whatever the backbone's size."""
@@ -117,8 +121,26 @@ def first_skeleton(
     Raises:
         ConfigError: no extractor at all.
     """
-    from labeling.extractors import Extractors, choose_extractors
+    from labeling.extractors import Extractors
     from labeling.observation import looks_of
+
+    choice = skeleton_extractors(extractors, models_dir=models_dir)
+    height = 2 * round(LABEL_WIDTH * picture.rgb_height / picture.rgb_width / 2)
+    seen = covered(image, width=LABEL_WIDTH, height=height)
+    looks = looks_of(Extractors(choice, models_dir=models_dir))
+    labels: list[Keypoints] = [label for look in looks for label in look.see(seen, 0)]
+    return LabelledFrame(labels=labels, width=LABEL_WIDTH, height=height).drawn(picture)
+
+
+def skeleton_extractors(
+    extractors: Sequence[str] | None = None, *, models_dir: Path | None = None
+) -> "ExtractorChoice":
+    """The extractors that find a picture's skeletons; arguments as for ``first_skeleton``.
+
+    Raises:
+        ConfigError: no extractor at all.
+    """
+    from labeling.extractors import choose_extractors
 
     choice = choose_extractors(extractors, models_dir=models_dir)
     if not choice.cards:
@@ -126,11 +148,7 @@ def first_skeleton(
             "there are no extractors to find the first skeleton with; give it (--skeleton FILE), or weights (--models "
             "DIR, or --extractors street for the shipped ones); `animatic models` lists them"
         )
-    height = 2 * round(LABEL_WIDTH * picture.rgb_height / picture.rgb_width / 2)
-    seen = covered(image, width=LABEL_WIDTH, height=height)
-    looks = looks_of(Extractors(choice, models_dir=models_dir))
-    labels: list[Keypoints] = [label for look in looks for label in look.see(seen, 0)]
-    return LabelledFrame(labels=labels, width=LABEL_WIDTH, height=height).drawn(picture)
+    return choice
 
 
 def ego_trajectory(source: str | Path | Trajectory, *, frames: int, fps: float) -> Trajectory:
