@@ -219,7 +219,8 @@ def test_what_is_missing_or_wrong_is_named(generator, adapters, tmp_path: Path, 
     with pytest.raises(DataError, match="not a picture"):
         generate(image=tmp_path / "a.png", caption="x", out=tmp_path, skeleton=SKELETON, **two_stages(adapters))
     with pytest.raises(ModelError, match=r"give the \.safetensors file"):
-        generate(image=IMAGE, caption="x", out=tmp_path, motion=tmp_path / "none.safetensors", backbone="tiny")
+        none = tmp_path / "none.safetensors"
+        generate(image=IMAGE, caption="x", out=tmp_path, motion=none, skeleton=SKELETON, backbone="tiny")
     from labeling import extractors
 
     monkeypatch.setattr(extractors, "find_weights", lambda *_: None)
