@@ -11,6 +11,7 @@ import json
 import os
 import re
 import socket
+import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -133,6 +134,17 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _as_storage_error(error, folder) from error
+
+
+def try_folder(folder: Path) -> None:
+    """Make a folder, and write to it: what takes minutes should know before them.
+
+    Raises:
+        StorageError: it cannot be made, or not be written to.
+    """
+    make_folder(folder)
+    with storage_errors(folder), tempfile.TemporaryFile(dir=folder):
+        pass
 
 
 def host_name() -> str:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dataset.receipts import atomic_write, make_folder, storage_errors
+from dataset.receipts import atomic_write, storage_errors, try_folder
 from labeling.errors import ConfigError
 
 CHARTS: dict[str, str] = {
@@ -133,7 +133,7 @@ def run_chart(name: str, *, out: Path, quick: bool = False) -> Chart:
     if name not in CHARTS:
         raise ConfigError(f"no chart is called {name!r}; choose one of {', '.join(CHARTS)}")
     # Before the minutes are spent.
-    make_folder(out)
+    try_folder(out)
     chart: Chart = importlib.import_module(CHARTS[name]).chart(name, quick=quick)
     write_chart(chart, out)
     return chart

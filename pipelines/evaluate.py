@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from dataset.loader import Sample, ShardDataset
-from dataset.receipts import atomic_write, digest, make_folder, sha256_file, storage_errors
+from dataset.receipts import atomic_write, digest, make_folder, sha256_file, storage_errors, try_folder
 from labeling.camera import read_tum, resample
 from labeling.errors import ConfigError
 from labeling.extractors import Extractors, choose_extractors
@@ -107,7 +107,7 @@ def evaluate(
     ruler = read_ruler(job, options)
     keys = [key for key in clips if key in folders[SAMPLES].by_key]
     out = options.out or samples / "evaluation"
-    make_folder(out)
+    try_folder(out)
     kept = _KeptClips(out / _KEPT)
     tasks = {}
     for key in keys:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from dataset.receipts import atomic_write, make_folder, storage_errors
+from dataset.receipts import atomic_write, storage_errors, try_folder
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
 from pipelines.reliability import ReliabilityCurve, draw_reliability
@@ -79,7 +79,7 @@ def run_stability(name: str, *, out: Path, quick: bool = False) -> StabilityTabl
             f"no stability table is called {name!r}; choose one of {', '.join(STABILITY) or 'none so far'}"
         )
     # Before the minutes are spent.
-    make_folder(out)
+    try_folder(out)
     table: StabilityTable = importlib.import_module(STABILITY[name]).stability(quick=quick)
     write_stability(table, out)
     return table

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import torch
 
-from dataset.receipts import atomic_write, make_folder, storage_errors
+from dataset.receipts import atomic_write, storage_errors, try_folder
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
 from pipelines.study_data import StudyClip, study_clips
@@ -128,7 +128,7 @@ def run_study(
 
     plan = plan_study(quick=quick) if minutes is None else plan_study(minutes, quick=quick)
     study = Study(plan=plan, out=out, say=say)
-    make_folder(out)
+    try_folder(out)
     with storage_errors(out):
         _claim(study)
         if not report:

@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 from typing import Any
@@ -17,6 +18,7 @@ from dataset.receipts import (
     read_receipts,
     reason_counts,
     storage_error,
+    try_folder,
 )
 from labeling.errors import DataError, StorageError
 
@@ -106,6 +108,18 @@ def test_a_folder_that_cannot_be_made_is_an_error_of_storage(tmp_path, place):
     ):
         with pytest.raises(StorageError, match=f"{place}.*; give a folder that can be written to"):
             write(folder)
+
+
+def test_a_folder_that_is_there_and_cannot_be_written_to_is_found_out(tmp_path, monkeypatch):
+    try_folder(tmp_path / "a")
+    assert list(tmp_path.iterdir()) == [tmp_path / "a"] and not list((tmp_path / "a").iterdir())
+
+    def refuse(**_):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    with pytest.raises(StorageError, match="a: read-only file system; give a folder"):
+        try_folder(tmp_path / "a")
 
 
 def test_published_files_are_whole_and_hashed(tmp_path):
