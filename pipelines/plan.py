@@ -2,22 +2,21 @@
 
 Lengths come from the headers, of files that are cut off from the packets. Costs come from a small job on windows of the
 same videos, with the same settings, in a scratch folder; a still smaller one before it pays for loading and compiling.
-Windows are laid around clips that the packets show to be whole, so that there is always something to measure on.
 """
 
 import functools
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dataset.receipts import Receipt, hashed_share, read_receipts
+from dataset.receipts import Receipt, read_receipts
 from labeling.ego_calibration import ROAD_FRAMES
 from labeling.errors import ConfigError, VideoError
 from labeling.mp4_boxes import is_cut_off
-from labeling.timeline import ClipSettings, Span, plan_clips, plan_timeline
+from labeling.timeline import ClipSettings
 from labeling.video import probe, read_packet_times
 from pipelines.commands import JobOptions, chosen_cards, configured
 from pipelines.config import Config
@@ -29,9 +28,9 @@ from pipelines.models import check_models_folder
 from pipelines.sources import Source, find_videos, with_leave_out
 from pipelines.stage import Part
 from pipelines.stages_source import packet_facts
+from pipelines.trial_windows import SourceClips, plan_windows, read_clips
 
 CALIBRATION_S = 60.0
-_WINDOWS = 3
 _FPS = 24
 
 
@@ -135,68 +134,6 @@ def count_candidates(length_s: float, clip: ClipSettings) -> int:
     """Clips that fit on a timeline of that length."""
     frames = int(length_s * _FPS) + 1
     return 0 if frames < clip.clip_frames else (frames - clip.clip_frames) // clip.stride_frames + 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SourceClips:
-    """Where the clips of a video lie on its grid."""
-
-    frames: int
-    """Of the grid."""
-    clips: tuple[Span, ...]
-    """In order; those that touch a hole or what is left out are not among them."""
-
-    def around(self, clips: Sequence[Span]) -> tuple[float, float]:
-        """Seconds to leave out at the start and at the end so that only ``clips`` are left, half a frame to spare."""
-        return max(0.0, (clips[0].start - 0.5) / _FPS), max(0.0, (self.frames - clips[-1].end - 0.5) / _FPS)
-
-
-def read_clips(source: Source, clip: ClipSettings) -> SourceClips:
-    """The clips of a video, from its packets.
-
-    Raises:
-        VideoError: it is no video that can be used.
-    """
-    timeline = plan_timeline(read_packet_times(source.path).times_s)
-    plan = plan_clips(
-        timeline, clip_frames=clip.clip_frames, stride_frames=clip.stride_frames, leave_out_s=source.leave_out_s
-    )
-    return SourceClips(frames=len(timeline), clips=plan.kept)
-
-
-def plan_windows(
-    sources: Sequence[Source], clips_of: Callable[[Source], SourceClips], *, clip_frames: int, seconds: float
-) -> list[Source]:
-    """Some of the videos with all but some clips in their middle left out, ``seconds`` together.
-
-    Videos are drawn by the hash of their id; each gives an equal share, at least one clip, short ones all they have.
-    Those that hold no clip are passed over, since nothing could be measured on them.
-    """
-    drawn = sorted(sources, key=lambda source: hashed_share("plan", source.video_id))
-    windows: list[Source] = []
-    left = seconds * _FPS
-    for source in drawn:
-        if windows and left < clip_frames:
-            break
-        found = clips_of(source)
-        if found.clips:
-            share = left / max(1, min(_WINDOWS, len(drawn)) - len(windows))
-            clips = middle_clips(found.clips, share)
-            windows.append(replace(source, leave_out_s=found.around(clips)))
-            left -= clips[-1].end - clips[0].start
-    return windows
-
-
-def middle_clips(clips: Sequence[Span], frames: float) -> Sequence[Span]:
-    """Neighbours around the middle clip that span at most ``frames``, and at least that clip."""
-    first = last = len(clips) // 2
-    while True:
-        wider = [(max(0, first - 1), last), (first, min(len(clips) - 1, last + 1))]
-        fits = [(a, b) for a, b in wider if (a, b) != (first, last) and clips[b].end - clips[a].start <= frames]
-        if not fits:
-            return clips[first : last + 1]
-        # The side that has had less comes first, so that the window stays in the middle.
-        first, last = min(fits, key=lambda pair: abs(pair[0] + pair[1] - len(clips) + 1))
 
 
 def _lengths_s(

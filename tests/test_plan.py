@@ -19,9 +19,10 @@ from labeling.errors import ConfigError
 from labeling.timeline import ClipSettings, plan_clips, plan_timeline
 from pipelines.commands import JobOptions
 from pipelines.job import Job
-from pipelines.plan import SourceClips, _Measured, _scaled, count_candidates, plan_job, plan_windows
+from pipelines.plan import _Measured, _scaled, count_candidates, plan_job
 from pipelines.plan_console import hours, show_plan, size
 from pipelines.sources import Source, find_videos
+from pipelines.trial_windows import SourceClips, plan_windows
 
 
 @pytest.fixture(scope="module")
