@@ -236,21 +236,6 @@ def moment_frames(sample: Sample, suffix: str, moments: int) -> list[tuple[int, 
     return [(index, found[index]) for index in wanted]
 
 
-def write_contact_sheet(sample: Sample, path: Path) -> None:
-    """Write a clip's contact sheet as a picture; the file's ending says of which kind.
-
-    Raises:
-        DataError: it cannot be written.
-    """
-    picture = cv2.cvtColor(contact_sheet(sample), cv2.COLOR_RGB2BGR)
-    try:
-        written = cv2.imwrite(str(path), picture)
-    except cv2.error as error:
-        raise DataError(f"{path}: is no picture's name; end it in .png or .jpg") from error
-    if not written:
-        raise DataError(f"{path}: cannot be written; give a folder that is there and can be written to")
-
-
 def _tile(frame: np.ndarray) -> np.ndarray:
     """A frame shrunk to fit a tile, on black."""
     scale = min(_TILE[0] / frame.shape[1], _TILE[1] / frame.shape[0])

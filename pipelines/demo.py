@@ -17,8 +17,9 @@ import numpy as np
 import yaml
 from rich.table import Table
 
-from dataset.inspection import clip_record, contact_sheet, find_sample, summarize, write_contact_sheet
+from dataset.inspection import clip_record, contact_sheet, find_sample, summarize
 from dataset.loader import Sample, ShardDataset
+from dataset.pictures import write_picture
 from dataset.receipts import atomic_write, make_folder
 from dataset.street import Scenario, Street, StreetConfig, write_street_video
 from labeling.errors import DataError
@@ -91,7 +92,7 @@ def run_demo(out: Path, *, workers: int | None = None) -> int:
         atomic_write(out / "demo.yaml", yaml.safe_dump(_SETTINGS).encode())
         code = run_label(videos, job, JobOptions(config=out / "demo.yaml", workers=workers))
     sample = find_sample(job)
-    write_contact_sheet(sample, out / "sheet.png")
+    write_picture(out / "sheet.png", contact_sheet(sample))
     truth = compare_with_truth(job)
     with _timed(times, "latents, two adapters, one sample"):
         losses, generated = train_and_generate(job, out, sample)

@@ -9,8 +9,9 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from dataset.inspection import Spread, Summary, clip_record, find_sample, summarize, write_contact_sheet
+from dataset.inspection import Spread, Summary, clip_record, contact_sheet, find_sample, summarize
 from dataset.loader import ShardDataset
+from dataset.pictures import write_picture
 from dataset.receipts import read_receipts, reason_counts
 from dataset.selection import read_selection
 from labeling.errors import AnimaticError, ConfigError, DataError
@@ -204,7 +205,7 @@ def inspect(
         return 0
     sample = find_sample(root, key)
     if sheet is not None:
-        write_contact_sheet(sample, sheet)
+        write_picture(sheet, contact_sheet(sample))
     if trajectory is not None:
         from dataset.trajectory_picture import write_trajectory_picture
 

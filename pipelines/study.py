@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import torch
 
+from dataset.pictures import write_picture
 from dataset.receipts import atomic_write, storage_errors, try_folder
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
@@ -282,11 +283,9 @@ def run_arm(study: Study, arm: Arm, seed: int) -> dict[str, Any]:
 
 def _show(study: Study, name: str, video: np.ndarray, *, frame_step: int) -> None:
     """Keep a strip of frames, at the same times for every arm."""
-    folder = study.out / "shown"
-    folder.mkdir(exist_ok=True)
     times = np.linspace(0, (study.plan.scale.frames - 1) // JUDGED_EVERY, SHOWN_FRAMES).round().astype(int)
     strip = np.concatenate(list(video[:: JUDGED_EVERY // frame_step][times]), axis=1)
-    cv2.imwrite(str(folder / f"{name}.png"), cv2.cvtColor(strip, cv2.COLOR_RGB2BGR))
+    write_picture(study.out / "shown" / f"{name}.png", strip)
 
 
 def _arm_record(arm: Arm, seed: int) -> str:

@@ -10,6 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from dataset.pictures import write_picture
+
 _COLOURS = {"better": "#2f855a", "worse": "#c53030", "no difference": "#2b6cb0", "inconclusive": "#a0aec0"}
 _STYLES = {"better": "green", "worse": "red", "no difference": "blue", "inconclusive": "dim"}
 _TITLES = {
@@ -92,4 +94,4 @@ def draw_sheet(folder: Path, path: Path) -> None:
         cv2.putText(label, name, (4, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
         rows += [label, large]
     if rows:
-        cv2.imwrite(str(path), np.concatenate(rows, axis=0))
+        write_picture(path, cv2.cvtColor(np.concatenate(rows, axis=0), cv2.COLOR_BGR2RGB))

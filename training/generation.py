@@ -288,5 +288,10 @@ def _told_config(adapters: Sequence[Path | None]) -> BackboneConfig:
     for path in adapters:
         told: dict[str, Any] = read_about(Path(path)).get("config", {}) if path is not None else {}
         if told:
-            return BackboneConfig.model_validate(told["backbone"])
+            try:
+                return BackboneConfig.model_validate(told["backbone"])
+            except (KeyError, ValueError) as error:
+                raise ConfigError(
+                    f"{path}: tells of a backbone that this version does not know; give --backbone"
+                ) from error
     raise ConfigError("the adapters do not say which backbone they are for; give --backbone")

@@ -369,4 +369,4 @@ def manifest_picture(store: LatentStore) -> PictureConfig:
     try:
         return PictureConfig.model_validate(store.manifest.backbone["picture"] | {"frames": store.manifest.frames})
     except (KeyError, ValueError) as error:
-        raise ConfigError(f"{store.folder / MANIFEST} names no picture ({error}); cache again") from error
+        raise ConfigError(f"{store.folder / MANIFEST} names no picture that this version knows; cache again") from error

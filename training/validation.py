@@ -3,11 +3,11 @@
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from accelerate import Accelerator
 
+from dataset.pictures import write_picture
 from dataset.receipts import storage_errors
 from labeling.encoding import VideoWriter
 from training.backbone import Backbone, SamplingSettings
@@ -104,5 +104,5 @@ def _write_sheet(path: Path, truth: np.ndarray, sample: np.ndarray) -> Path:
     moments = np.linspace(0, len(truth) - 1, min(_MOMENTS, len(truth))).round().astype(int)
     rows = [np.concatenate(list(frames[moments]), axis=1) for frames in (truth, sample)]
     sheet = np.concatenate(rows, axis=0)
-    cv2.imwrite(str(path), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
+    write_picture(path, sheet)
     return path
