@@ -13,9 +13,11 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
     """Write an (H, W, 3) uint8 RGB picture; the file's ending says of which kind.
 
     Raises:
-        DataError: an ending that is no picture's.
+        DataError: an ending that is no picture's, or a folder that is not there.
         StorageError: no space, or the folder cannot be written to.
     """
+    if not path.parent.is_dir():
+        raise DataError(f"{path}: cannot be written; give a folder that is there")
     try:
         _, data = cv2.imencode(path.suffix.lower(), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     except cv2.error as error:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from dataset.pictures import write_picture
-from dataset.receipts import atomic_write, storage_errors, try_folder
+from dataset.receipts import atomic_write, make_folder, storage_errors, try_folder
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
 from pipelines.study_data import StudyClip, study_clips
@@ -283,6 +283,7 @@ def run_arm(study: Study, arm: Arm, seed: int) -> dict[str, Any]:
 
 def _show(study: Study, name: str, video: np.ndarray, *, frame_step: int) -> None:
     """Keep a strip of frames, at the same times for every arm."""
+    make_folder(study.out / "shown")
     times = np.linspace(0, (study.plan.scale.frames - 1) // JUDGED_EVERY, SHOWN_FRAMES).round().astype(int)
     strip = np.concatenate(list(video[:: JUDGED_EVERY // frame_step][times]), axis=1)
     write_picture(study.out / "shown" / f"{name}.png", strip)

@@ -10,9 +10,9 @@ from labeling.errors import DataError, StorageError
 PICTURE = np.random.default_rng(0).integers(0, 256, (9, 14, 3), dtype=np.uint8)
 
 
-def test_a_png_keeps_every_colour_in_a_folder_that_is_made(tmp_path: Path) -> None:
-    write_picture(tmp_path / "new" / "a.PNG", PICTURE)
-    read = cv2.imread(str(tmp_path / "new" / "a.PNG"))
+def test_a_png_keeps_every_colour(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.PNG", PICTURE)
+    read = cv2.imread(str(tmp_path / "a.PNG"))
     assert read is not None and np.array_equal(read[..., ::-1], PICTURE)
 
 
@@ -24,6 +24,8 @@ def test_an_ending_that_is_no_pictures_is_said(tmp_path: Path, name: str) -> Non
 
 
 def test_a_place_that_cannot_be_written_to_is_said(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="give a folder that is there"):
+        write_picture(tmp_path / "none" / "a.png", PICTURE)
+    (tmp_path / "a.png").mkdir()
     with pytest.raises(StorageError):
-        write_picture(tmp_path / "file" / "a.png", PICTURE)
+        write_picture(tmp_path / "a.png", PICTURE)
