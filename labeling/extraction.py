@@ -5,8 +5,9 @@ between these the points of cars and people are carried by optical flow, and lan
 follow, by straight lines. How often they look is ``efforts``'; what is shown in between is ``between_looks``'.
 
 A picture that is shown again is the same moment: nothing moves, nothing is looked at, and what follows it does not
-start from rest. Tracks, flow and smoothing therefore count moments; how long until the next look, how long something
-must last, and how long after its last sight it may be shown, are times, and count frames of the grid.
+start from rest. Flow and smoothing therefore count moments. Tracks, how long until the next look, how long something
+must last, and how long after its last sight it may be shown, go by time: they count frames of the grid, but for those
+of a picture that is shown for longer than is usual in its source.
 """
 
 from collections.abc import Iterable, Sequence
@@ -231,8 +232,8 @@ class _Channel:
         self._turn(views, number)
         seen = [replace(label, frame=number) for label in self.look.see(views.frame, views.number)]
         carried = self._between.carried(number)
-        named = self._tracker.update(seen, frame=number, previous_to_current=self._turned, carried=carried)
-        self._looks.append(TrackedLook(frame=number, labels=tuple(named), turn=self._turned))
+        named = self._tracker.update(seen, frame=self._clock, previous_to_current=self._turned, carried=carried)
+        self._looks.append(TrackedLook(frame=self._clock, labels=tuple(named), turn=self._turned))
         seen = [label for label in named if label.track_id != UNTRACKED]
         self._turned = np.eye(3)
         if self._far is None and not self._tracker.idle:

@@ -39,7 +39,7 @@ class KeypointsStage:
             video_id, run = parse_run_item(name)
             items.append(
                 WorkItem(
-                    stage=self.name, name=name, owner=video_id, version=2, settings=settings, models=models,
+                    stage=self.name, name=name, owner=video_id, version=3, settings=settings, models=models,
                     inputs={output.path: output.sha256 for output in receipt.outputs},
                     outputs=(run_path(video_id, run, ".keypoints.parquet"),), weight=float(len(run)),
                     payload={"models_dir": str(job.models_dir) if job.models_dir else None},

@@ -223,6 +223,15 @@ def shown(scene: MovingCard, *, frames: int = 100) -> list[Keypoints]:
     return label_with([scene], (scene.render(t) for t in range(frames)), first_frame=0, effort="exact")
 
 
+@pytest.mark.parametrize("every", [1, 2, 3, 4])
+@pytest.mark.parametrize(("hidden", "tracks"), [(24, 1), (60, 2)])
+def test_who_is_hidden_for_a_second_is_the_same_at_any_frame_rate(hidden: int, tracks: int, every: int) -> None:
+    scene = ComesAndGoes([*range(48), *range(48 + hidden, 156)])
+    frames = (scene.render(t - t % every) for t in range(156))
+    labels = label_with([scene], frames, first_frame=0, effort="exact")
+    assert len({label.track_id for label in labels}) == tracks
+
+
 def test_ids_count_from_0_whatever_was_dropped() -> None:
     """What was there for four frames leaves no gap in the numbers."""
     labels = shown(ComesAndGoes([*range(10, 14), *range(70, 90)]))
