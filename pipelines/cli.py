@@ -11,6 +11,7 @@ from pipelines.cli_options import (
     LABEL,
     LOOK,
     STAGES,
+    STOPPED,
     AsJson,
     Cameras,
     ConfigFile,
@@ -47,9 +48,11 @@ def main() -> None:
 
         print_error(error)
         sys.exit(2)
-    except KeyboardInterrupt:
-        print("stopped; run the same command again to go on", file=sys.stderr)
-        sys.exit(130)
+    except SystemExit as stop:
+        # typer makes this of Ctrl-C, without a word.
+        if stop.code == STOPPED:
+            print("stopped; run the same command again to go on", file=sys.stderr)
+        raise
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+STOPPED = 130
+"""Exit code of a command that was interrupted and goes on when it is run again."""
 LABEL, STAGES, LOOK, TRAIN, MEASURE = "Label videos", "Single stages", "Look", "Train and sample", "Measure"
 
 Videos = Annotated[list[Path], typer.Argument(help="Video files, folders of them, or text files of paths.")]

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipelines.cli_options import MEASURE, TRAIN, Effort, Extractors, JobFolder, Models, Workers
+from pipelines.cli_options import MEASURE, STOPPED, TRAIN, Effort, Extractors, JobFolder, Models, Workers
 
 commands = typer.Typer()
 
@@ -48,7 +48,7 @@ def train(
     result = run_train(
         stage, data=data, config=config, out=out, resume=resume, dry_run=dry_run, steps_per_second=steps_per_second
     )
-    raise typer.Exit(1 if getattr(result, "interrupted", False) else 0)
+    raise typer.Exit(STOPPED if getattr(result, "interrupted", False) else 0)
 
 
 @commands.command(rich_help_panel=TRAIN)

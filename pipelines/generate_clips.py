@@ -18,7 +18,7 @@ from labeling.object_video import object_frames
 from labeling.skeleton_video import draw_skeletons
 from labeling.timeline import Span
 from pipelines.console import counted, counting_bar, make_console
-from pipelines.train import GenerateOptions, check_start, clip_conditions, sample_facts
+from pipelines.train import GenerateOptions, check_start, clip_conditions, sample_facts, tell_unfinished
 from training.backbone import SamplingSettings
 from training.config import PictureConfig
 from training.generation import (
@@ -92,6 +92,7 @@ def show_clips(
     if job is None:
         raise ConfigError("--clips, --true-skeletons and --object-variant are of a job's clips; give --data JOB too")
     check_start(data=job, image=image, skeleton=skeleton)
+    tell_unfinished(motion, appearance, end_to_end)
     given = {"motion": motion, "appearance": appearance, "end_to_end": end_to_end}
     with counting_bar() as progress:
         task = progress.add_task("generate", total=None)

@@ -1,13 +1,15 @@
 """What to type next in a job that is packed: its latents, then its adapters, then a sample.
 
-Read from the names of files alone, since the modules that write them load torch.
+Read from names and headers of files alone, since the modules that write them load torch.
 """
 
 from pathlib import Path
 
 from dataset.shards import read_shard_index
+from labeling.errors import ModelError
 from pipelines.console import counted
 from pipelines.layout import SHARD_INDEX
+from training.adapter_notes import adapter_file, read_progress
 from training.config import BACKBONES, config_names
 
 _ADAPTERS = ("motion", "appearance")
@@ -37,13 +39,26 @@ def _next_of(root: Path, store: Path, keys: set[str]) -> tuple[int, str, str]:
     for stage in _ADAPTERS:
         recipe = _recipe(stage, store.name)
         adapter = root / "adapters" / f"{recipe}_{stage}"
-        if not (adapter / "adapter.safetensors").is_file():
-            command = f"animatic train {stage} --data {root} --config {recipe}"
-            return 1 + len(made), command, f"latents of {store.name} are cached, no {stage} adapter is in {adapter}"
+        command = f"animatic train {stage} --data {root} --config {recipe}"
+        if lacking := _lacking(adapter):
+            return 1 + len(made), command, f"latents of {store.name} are cached; {lacking}"
         made.append(adapter)
     motion, appearance = made
     command = f"animatic generate --data {root} --motion {motion} --appearance {appearance} --out {root / 'samples'}"
     return 1 + len(made), command, "both adapters are there"
+
+
+def _lacking(adapter: Path) -> str:
+    """What an adapter's folder lacks; empty where its training has ended."""
+    if not adapter_file(adapter).is_file():
+        return f"no adapter is in {adapter}"
+    try:
+        progress = read_progress(adapter)
+    except ModelError as error:
+        return str(error)
+    if progress is None or progress.finished:
+        return ""
+    return f"{adapter} has done {progress.step} of {progress.steps} steps"
 
 
 def _recipe(stage: str, backbone: str) -> str:

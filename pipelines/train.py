@@ -16,6 +16,7 @@ from labeling.camera import Intrinsics, rebased_trajectory
 from labeling.errors import ConfigError
 from pipelines.console import counted, counting_bar, file_size, make_console
 from pipelines.stage import parse_part
+from training.adapter_notes import read_progress
 from training.config import STAGES, Stage, load_config
 from training.dry_run import RunPlan
 from training.flow import Convention
@@ -108,7 +109,7 @@ def _show_run(stage: str, summary: TrainSummary) -> None:
     course = f", loss {losses[0]:.4f} to {losses[-1]:.4f}" if losses else ""
     console.print(f"{stage}: {summary.steps} steps{course}; {summary.adapter}")
     if summary.interrupted:
-        console.print("interrupted, and saved first; the same command goes on from there")
+        console.print("interrupted, and saved first")
 
 
 def _resume(text: str) -> Any:
@@ -128,6 +129,7 @@ def run_generate(
     """
     options = options or GenerateOptions()
     check_start(data=data, clip=clip, image=image, skeleton=skeleton)
+    tell_unfinished(motion, appearance, end_to_end)
     sample = None if data is None else find_sample(data, clip)
     if sample is not None:
         conditions = clip_conditions(sample, with_ego=ego is None)
@@ -154,6 +156,15 @@ def run_generate(
     for made in files:
         console.print(" ".join(str(path) for path in (made.control, made.rgb) if path is not None))
     return files
+
+
+def tell_unfinished(*adapters: Path | None) -> None:
+    """Say which of the adapters are of trainings that have not ended."""
+    for path in filter(None, adapters):
+        if (progress := read_progress(path)) and not progress.finished:
+            make_console().print(
+                f"[yellow]note[/] {path} has done {progress.step} of {progress.steps} steps; `animatic train` goes on"
+            )
 
 
 def sample_facts(

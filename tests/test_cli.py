@@ -3,15 +3,19 @@
 import json
 import re
 import shutil
+import signal
 import subprocess
 import sys
 
 import cv2
+import numpy as np
 import pytest
 import yaml
 from pipeline_fixtures import SMALL, write_detector, write_street
+from safetensors.numpy import save_file
 
 from pipelines.cli import main
+from training.adapter_notes import OUR_METADATA
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +104,11 @@ def test_status_goes_on_to_training(run, job, tmp_path):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).touch()
 
+    def trained(name, step, steps):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        about = {"step": step, "config": {"optimiser": {"steps": steps}}}
+        save_file({"a": np.zeros(1)}, root / name, metadata={OUR_METADATA: json.dumps(about)})
+
     def following():
         code, out, _ = run("status", root, "--json")
         return code, json.loads(out)["next_command"]
@@ -111,14 +120,29 @@ def test_status_goes_on_to_training(run, job, tmp_path):
     there("latents/ltx-2b/clips/street/street_8.safetensors")
     assert following() == (0, f"animatic train motion --data {root} --config motion_ltx_2b")
     there("adapters/motion_ltx_2b_motion/adapter.safetensors")
+    assert following() == (0, f"animatic train motion --data {root} --config motion_ltx_2b"), "an empty file"
+    trained("adapters/motion_ltx_2b_motion/adapter.safetensors", 37, 40)
+    assert following() == (0, f"animatic train motion --data {root} --config motion_ltx_2b")
+    assert "has done 37 of 40 steps" in run("status", root)[1]
+    trained("adapters/motion_ltx_2b_motion/adapter.safetensors", 40, 40)
     assert following() == (0, f"animatic train appearance --data {root} --config appearance_ltx_2b")
     there("latents/mine/cache.json")
     assert following() == (0, f"animatic train appearance --data {root} --config appearance_ltx_2b")
-    there("adapters/appearance_ltx_2b_appearance/adapter.safetensors")
+    trained("adapters/appearance_ltx_2b_appearance/adapter.safetensors", 7, 7)
     adapters = "--motion {0}/motion_ltx_2b_motion --appearance {0}/appearance_ltx_2b_appearance"
     assert following() == (
         0, f"animatic generate --data {root} {adapters.format(root / 'adapters')} --out {root / 'samples'}"
     )  # fmt: skip
+
+
+def test_ctrl_c_says_how_to_go_on(video, tmp_path):
+    command = [sys.executable, "-m", "pipelines", "label", video, "-o", tmp_path / "J", "--keep-share", "1"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    process.stdout.readline()  # The first line: the job has begun.
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and err.endswith("stopped; run the same command again to go on\n")
 
 
 def test_a_finished_job_is_labelled_again_at_once(run, job):

@@ -7,7 +7,6 @@ Extra trained tensors (SVD's widened ``conv_in`` and its text projection) go und
 Switching changes flags only: the base weights are never merged, so switching off restores the base to the bit.
 """
 
-import contextlib
 import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,13 +17,13 @@ from typing import Any
 import torch
 from peft import LoraConfig, inject_adapter_in_model
 from peft.tuners.tuners_utils import BaseTunerLayer
-from safetensors import SafetensorError, safe_open
 
 from labeling.errors import ModelError
+from training.adapter_notes import OUR_METADATA, notes, open_adapter
 from training.config import AdapterConfig
 from training.weights import tensor_bytes
 
-DIFFUSERS_METADATA, OUR_METADATA = "lora_adapter_metadata", "animatic"
+DIFFUSERS_METADATA = "lora_adapter_metadata"
 EXTRA_PREFIX = "extra."
 _SPECIAL = ("use_rslora", "use_dora", "alpha_pattern")
 """Settings of PEFT under which a LoRA's scale is not alpha / rank throughout."""
@@ -172,7 +171,7 @@ def read_adapter(path: Path) -> AdapterFile:
             rank-stabilised, DoRA, alphas that differ from module to module.
     """
     path = path / "adapter.safetensors" if path.is_dir() else path
-    with _opened(path) as file:
+    with open_adapter(path, framework="pt") as file:
         metadata = file.metadata() or {}
         raw = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     extra = {key.removeprefix(EXTRA_PREFIX): raw.pop(key) for key in list(raw) if key.startswith(EXTRA_PREFIX)}
@@ -195,31 +194,8 @@ def read_adapter(path: Path) -> AdapterFile:
         )
     alpha = float(settings["lora_alpha"]) if "lora_alpha" in settings else alphas.pop() if alphas else float(rank)
     targets = tuple(sorted({key.split(".lora_")[0] for key in tensors}))
-    about = _about(metadata)
+    about = notes(metadata)
     return AdapterFile(tensors=tensors, extra=extra, rank=rank, alpha=alpha, targets=targets, about=about)
-
-
-def read_about(path: Path) -> dict[str, Any]:
-    """What the trainer noted in an adapter file, without reading its tensors; empty for foreign files.
-
-    Raises:
-        ModelError: missing, or not safetensors.
-    """
-    with _opened(path / "adapter.safetensors" if path.is_dir() else path) as file:
-        return _about(file.metadata() or {})
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    try:
-        with safe_open(path, framework="pt") as file:
-            yield file
-    except (OSError, SafetensorError) as error:
-        raise ModelError(f"{path} is no adapter: {error}; give the .safetensors file that training wrote") from error
-
-
-def _about(metadata: Mapping[str, str]) -> dict[str, Any]:
-    return json.loads(metadata.get(OUR_METADATA, "{}"))
 
 
 def _plain_key(key: str) -> str:

@@ -12,7 +12,8 @@ import torch
 
 from labeling.camera import Trajectory
 from labeling.errors import ConfigError
-from training.adapters import AdapterFile, activate_adapter, read_about
+from training.adapter_notes import read_about
+from training.adapters import AdapterFile, activate_adapter
 from training.backbone import Backbone, SamplingSettings, TextEmbedding
 from training.config import PictureConfig, Stage
 from training.draws import keyed_normal, keyed_seed

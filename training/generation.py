@@ -17,7 +17,7 @@ from dataset.receipts import atomic_write, make_folder, sha256_file, storage_err
 from labeling.camera import Intrinsics, Trajectory, write_tum
 from labeling.encoding import VideoWriter, lossless_rgb
 from labeling.errors import ConfigError
-from training.adapters import read_about
+from training.adapter_notes import adapter_file, read_about
 from training.backbone import Backbone, SamplingSettings
 from training.backbones import load_backbone
 from training.clip_generator import ClipConditions, ClipGenerator, GeneratedClip
@@ -219,11 +219,7 @@ def sampling_record(
 def adapter_hashes(generator: ClipGenerator) -> dict[str, str]:
     """sha256 of each stage's adapter file."""
     given = {"appearance": generator.appearance, "end_to_end": generator.end_to_end, "motion": generator.motion}
-    return {
-        stage: sha256_file(path / "adapter.safetensors" if path.is_dir() else path)
-        for stage, path in given.items()
-        if path is not None
-    }
+    return {stage: sha256_file(adapter_file(path)) for stage, path in given.items() if path is not None}
 
 
 def prepare_conditions(

@@ -1,0 +1,72 @@
+"""What the trainer notes in an adapter file; read without torch, and without the tensors."""
+
+import contextlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from safetensors import SafetensorError, safe_open
+
+from labeling.errors import ModelError
+
+OUR_METADATA = "animatic"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """How far the training of an adapter has come."""
+
+    step: int
+    steps: int
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps are done."""
+        return self.step >= self.steps
+
+
+def adapter_file(path: Path) -> Path:
+    """The file of an adapter that is named by its folder or by itself."""
+    return path / "adapter.safetensors" if path.is_dir() else path
+
+
+def read_about(path: Path) -> dict[str, Any]:
+    """What the trainer noted in an adapter file; empty for foreign files.
+
+    Raises:
+        ModelError: missing, or not safetensors.
+    """
+    with open_adapter(adapter_file(path), framework="np") as file:
+        return notes(file.metadata() or {})
+
+
+def read_progress(path: Path) -> Progress | None:
+    """How far an adapter's training has come; None where the file does not tell.
+
+    Raises:
+        ModelError: missing, or not safetensors.
+    """
+    about = read_about(path)
+    step, steps = about.get("step"), about.get("config", {}).get("optimiser", {}).get("steps")
+    return Progress(step=step, steps=steps) if isinstance(step, int) and isinstance(steps, int) else None
+
+
+def notes(metadata: Mapping[str, str]) -> dict[str, Any]:
+    """The trainer's notes among a file's metadata."""
+    return json.loads(metadata.get(OUR_METADATA, "{}"))
+
+
+@contextlib.contextmanager
+def open_adapter(path: Path, *, framework: Literal["pt", "np"]) -> Iterator[Any]:
+    """An adapter file, opened; its tensors come as the framework's.
+
+    Raises:
+        ModelError: missing, or not safetensors.
+    """
+    try:
+        with safe_open(path, framework=framework) as file:
+            yield file
+    except (OSError, SafetensorError) as error:
+        raise ModelError(f"{path} is no adapter: {error}; give the .safetensors file that training wrote") from error
