@@ -47,6 +47,11 @@ class ExtractorChoice:
         found |= {head_category(name) for card in self.fields for name in _schemas(card)}
         return tuple(category for category in CATEGORIES if category not in found)
 
+    @property
+    def draws_nothing(self) -> bool:
+        """Whether no category gets keypoints: skeletons are black."""
+        return set(self.missing_categories) == set(CATEGORIES)
+
 
 def choose_extractors(names: Sequence[str] | None, *, models_dir: Path | None = None) -> ExtractorChoice:
     """The cards for a job.

@@ -6,6 +6,7 @@ from pathlib import Path
 from dataset.loader import Sample, ShardDataset
 from dataset.receipts import atomic_write
 from labeling.errors import ConfigError
+from pipelines.black_skeletons import print_black_skeletons
 from pipelines.console import counted, make_console
 
 
@@ -27,6 +28,7 @@ def export_released(job: Path, out: Path, *, split: str = "train") -> int:
     lines = [json.dumps(_export_clip(sample, out)) for sample in dataset]
     manifest = out / f"{split}.jsonl"
     atomic_write(manifest, ("\n".join(lines) + "\n").encode())
+    print_black_skeletons(job, make_console())
     make_console().print(f"{counted(len(lines), 'clip')} in {manifest}")
     return 0
 

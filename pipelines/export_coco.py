@@ -20,6 +20,7 @@ from labeling.labels import Keypoints
 from labeling.schemas import keypoint_schema
 from labeling.timeline import FPS, Span
 from labeling.video import read_frames
+from pipelines.black_skeletons import print_black_skeletons
 from pipelines.console import counted, make_console
 from pipelines.job import Job, open_job
 from pipelines.layout import parse_run_item, run_path
@@ -86,6 +87,7 @@ def export_coco(job_folder: Path, out: Path, *, split: str = "train", images: bo
             _write_images(job.root, run, out)
     count = counted(sum(len(run.frames) for run in runs), "image")
     pictures = f"their pictures in {out / 'images'}" if images else "without their pictures: --images writes them too"
+    print_black_skeletons(job_folder, make_console())
     make_console().print(f"{count} of {counted(len(runs), 'run')} in {table}, {pictures}")
     return 0
 

@@ -15,6 +15,7 @@ from dataset.pictures import write_picture
 from dataset.receipts import read_receipts, reason_counts
 from dataset.selection import read_selection
 from labeling.errors import AnimaticError, ConfigError, DataError
+from pipelines.black_skeletons import print_black_skeletons
 from pipelines.console import counted, file_size, make_console, print_damaged, shortened
 from pipelines.damage import damaged_videos
 from pipelines.job import Job, open_job
@@ -161,6 +162,7 @@ def print_status(root: Path, *, as_json: bool = False) -> int:
     for line in failure_lines(root):
         console.print(f"[red]{escape(line)}[/]")
     print_damaged(status.damaged, console, most=20)
+    print_black_skeletons(root, console)
     if status.nothing_left:
         console.print(f"[red]{escape(status.nothing_left)}[/]")
     console.print(f"next: [bold]{escape(status.next_command)}[/]  [dim]({escape(status.next_reason)})[/]")
@@ -255,6 +257,7 @@ def _print_summary(root: Path, summary: Summary) -> None:
     console.print(table)
     if (root / "job.yaml").is_file():
         print_damaged(damaged_videos(open_job(root)), console)
+    print_black_skeletons(root, console)
     if sum(summary.packed.values()):
         console.print(f"one clip: [bold]animatic inspect {root} {_some_key(root)} --sheet sheet.png[/]")
     elif not summary.kept or (root / SHARD_INDEX).is_file():

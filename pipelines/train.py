@@ -14,6 +14,7 @@ from dataset.loader import Sample
 from dataset.receipts import sha256_file
 from labeling.camera import Intrinsics, rebased_trajectory
 from labeling.errors import ConfigError
+from pipelines.black_skeletons import print_black_skeletons
 from pipelines.console import counted, counting_bar, file_size, make_console
 from pipelines.stage import parse_part
 from training.adapter_notes import read_progress
@@ -87,6 +88,8 @@ def run_train(
         raise ConfigError(f"stage {stage!r} is not known; choose one of {', '.join(STAGES)}")
     recipe = load_config(config, stage=cast(Stage, stage), overrides=overrides)
     out = out or data / "adapters" / f"{recipe.name}_{stage}"
+    if stage != "end_to_end" and _is_first_process():
+        print_black_skeletons(data, make_console())
     result = train(
         recipe, data=data, out=out, resume=_resume(resume), dry_run=dry_run, steps_per_second=steps_per_second,
         on_step=on_step, quiet=on_step is not None,
@@ -101,9 +104,13 @@ def run_train(
     return result
 
 
+def _is_first_process() -> bool:
+    """torchrun and accelerate launch start this command once a process; one of them speaks."""
+    return os.environ.get("RANK", "0") == "0"
+
+
 def _show_run(stage: str, summary: TrainSummary) -> None:
-    # torchrun and accelerate launch start this command once a process.
-    if os.environ.get("RANK", "0") != "0":
+    if not _is_first_process():
         return
     losses, console = summary.losses, make_console()
     course = f", loss {losses[0]:.4f} to {losses[-1]:.4f}" if losses else ""

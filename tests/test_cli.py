@@ -135,6 +135,13 @@ def test_status_goes_on_to_training(run, job, tmp_path):
     )  # fmt: skip
 
 
+def test_black_skeletons_are_told_of_wherever_they_would_be_used(run, job, tmp_path):
+    """The job's only network gives boxes."""
+    for command in (["status", job], ["inspect", job], ["export", "coco", job, "--out", tmp_path / "coco"]):
+        code, out, _ = run(*command)
+        assert code == 0 and "skeletons are black" in " ".join(out.split()), command
+
+
 def test_ctrl_c_says_how_to_go_on(video, tmp_path):
     command = [sys.executable, "-m", "pipelines", "label", video, "-o", tmp_path / "J", "--keep-share", "1"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

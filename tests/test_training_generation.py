@@ -322,13 +322,14 @@ def test_the_record_of_one_clip_tells_what_it_was_made_of(adapters, tmp_path: Pa
     assert sorted(record["files"]) == ["image", "skeleton"]
 
 
+@pytest.mark.parametrize("extractors", [None, ["street_detector"]], ids=["none", "boxes alone"])
 def test_no_extractor_for_the_first_skeleton_is_said_before_anything_is_loaded(
-    adapters, tmp_path: Path, monkeypatch
+    adapters, tmp_path: Path, monkeypatch, extractors
 ) -> None:
     monkeypatch.setenv("ANIMATIC_MODELS", str(tmp_path))
     monkeypatch.setattr("training.generation.load_backbone", lambda *_, **__: pytest.fail("it was loaded"))
-    with pytest.raises(ConfigError, match=r"no extractors to find the first skeleton.*--models DIR"):
-        generate(image=IMAGE, caption="x", out=tmp_path, **two_stages(adapters))
+    with pytest.raises(ConfigError, match=r"no keypoint extractors to find the first skeleton.*--models DIR"):
+        generate(image=IMAGE, caption="x", out=tmp_path, **two_stages(adapters), extractors=extractors)
 
 
 def test_videos_have_the_adapters_frame_rate_whatever_the_backbone_says(tmp_path: Path) -> None:

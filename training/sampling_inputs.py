@@ -119,7 +119,7 @@ def first_skeleton(
         models_dir: where weights lie.
 
     Raises:
-        ConfigError: no extractor at all.
+        ConfigError: no extractor that gives keypoints.
     """
     from labeling.extractors import Extractors
     from labeling.observation import looks_of
@@ -138,15 +138,15 @@ def skeleton_extractors(
     """The extractors that find a picture's skeletons; arguments as for ``first_skeleton``.
 
     Raises:
-        ConfigError: no extractor at all.
+        ConfigError: none of them gives keypoints.
     """
     from labeling.extractors import choose_extractors
 
     choice = choose_extractors(extractors, models_dir=models_dir)
-    if not choice.cards:
+    if choice.draws_nothing:
         raise ConfigError(
-            "there are no extractors to find the first skeleton with; give it (--skeleton FILE), or weights (--models "
-            "DIR, or --extractors street for the shipped ones); `animatic models` lists them"
+            "there are no keypoint extractors to find the first skeleton with; give it (--skeleton FILE), or weights "
+            "(--models DIR, or --extractors street for the shipped ones); `animatic models` lists them"
         )
     return choice
 
