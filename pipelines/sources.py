@@ -178,12 +178,14 @@ def _expand(argument: Path, out: Path | None) -> list[tuple[str, Path]]:
 
 
 def _files_below(folder: Path, out: Path | None) -> Iterator[Path]:
-    """Every video file below a folder, but those of jobs."""
+    """Every video file below a folder, but those of jobs; a link to nothing is one, so that it is told of."""
     for place, folders, names in os.walk(folder):
         here = Path(place)
         folders[:] = [name for name in folders if not _is_job(here / name, out)]
         files = (here / name for name in names)
-        yield from (path for path in files if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file())
+        yield from (
+            path for path in files if path.suffix.lower() in VIDEO_SUFFIXES and (path.is_file() or path.is_symlink())
+        )
 
 
 def _is_job(folder: Path, out: Path | None) -> bool:

@@ -13,7 +13,7 @@ from labeling.errors import ConfigError
 from pipelines.commands import JobOptions, prepare_job, run_select
 from pipelines.config import merged
 from pipelines.job import Job, open_job
-from pipelines.sources import Source
+from pipelines.sources import Source, find_videos
 from pipelines.stage import NotReadyError
 
 UP_TO_COUNT = ("source", "index", "count")
@@ -133,6 +133,16 @@ def test_a_job_inside_the_videos_folder_takes_nothing_of_a_job_for_a_source(tmp_
     for _ in range(2):
         job = prepare_job([two_files], root, JobOptions())
         assert list(job.sources) == ["a", "b", "d"]
+
+
+def test_a_link_to_a_video_that_is_gone_is_told_of(tmp_path, two_files):
+    """Half of a linked data set on a disk that is not mounted must not vanish in silence."""
+    (two_files / "gone.mp4").symlink_to(tmp_path / "nowhere.mp4")
+    sources = {source.video_id: source for source in find_videos([two_files])}
+    job = Job(tmp_path / "J", small_config(), {"gone": sources["gone"]})
+    run_all(job, stages=("source",))
+    (receipt,) = read_receipts(job.root, "source").values()
+    assert receipt.state == "failed" and "no such file" in receipt.message
 
 
 def test_a_job_s_own_folder_is_no_folder_of_videos(tmp_path, two_files):

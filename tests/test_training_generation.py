@@ -398,7 +398,7 @@ def test_the_first_skeleton_is_what_the_extractors_see(monkeypatch: pytest.Monke
             shown.append(picture.shape)
             return [label]
 
-    monkeypatch.setattr(extractors, "choose_extractors", lambda *_, **__: SimpleNamespace(cards=["one"]))
+    monkeypatch.setattr(extractors, "choose_extractors", lambda *_, **__: SimpleNamespace(draws_nothing=False))
     monkeypatch.setattr(extractors, "Extractors", lambda *_, **__: None)
     monkeypatch.setattr(observation, "looks_of", lambda _: [Look()])
     found = first_skeleton(IMAGE, picture=PictureConfig.model_validate(PICTURE))
