@@ -5,7 +5,15 @@ from pathlib import Path
 
 from labeling.extractors import ExtractorChoice
 from training.evaluation_files import SampleFolder
-from training.evaluation_report import SAMPLES, TRUE_SKELETONS, ClipResult, Report
+from training.evaluation_report import (
+    FIGURES,
+    FLOOR,
+    SAMPLES,
+    TRUE_SKELETONS,
+    VELOCITY,
+    ClipResult,
+    Report,
+)
 
 _FEW_VIDEOS = 5
 
@@ -85,6 +93,7 @@ def result_notes(report: Report, results: Sequence[ClipResult], *, longest_s: fl
         rest = f"minADE and APD rest on {sum(used) / len(used):.1f} samples of a clip, and fewer make minADE larger"
         some = f"trajectories were found in {sum(used)} of {judged.samples} samples"
         notes.append(f"{some}: {rest if any(used) else 'nothing can be said of how the camera moves'}")
+    notes += blind_ruler(report)
     if len(judged.geometries) > 1:
         notes.append(
             f"samples are of {len(judged.geometries)} frame rates, sizes or lengths; each is judged at its own"
@@ -97,3 +106,20 @@ def result_notes(report: Report, results: Sequence[ClipResult], *, longest_s: fl
         )
         notes.append(f"intervals rest on {what}")
     return notes
+
+
+def blind_ruler(report: Report) -> list[str]:
+    """Figures in which the truth itself is worse than a guess that looks at nothing: such videos cannot be read."""
+    floor, guess = (report.sets[name].figures if name in report.sets else {} for name in (FLOOR, VELOCITY))
+    worse = [
+        figure.label.format(k="")
+        for figure in FIGURES
+        if figure.name in floor and figure.name in guess and figure.better != "neither"
+        and (floor[figure.name].mean - guess[figure.name].mean) * (1 if figure.better == "lower" else -1) > 0
+    ]  # fmt: skip
+    if not worse:
+        return []
+    return [
+        f"the truth's own video is worse than constant velocity in {', '.join(worse)}: at this size videos are read too "
+        "badly for these figures to say much"
+    ]

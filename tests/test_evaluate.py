@@ -25,7 +25,7 @@ from pipelines.cli import app
 from pipelines.config import Config, merged
 from pipelines.evaluate import EvaluateOptions, Evaluation, evaluate
 from pipelines.evaluate_console import coverage_table, figure_table
-from pipelines.evaluate_notes import clip_notes, record_notes, ruler_notes
+from pipelines.evaluate_notes import blind_ruler, clip_notes, record_notes, ruler_notes
 from pipelines.generate_clips import ClipsRequest, chosen_clips, generate_clips
 from pipelines.job import Job
 from pipelines.sources import Source
@@ -340,6 +340,24 @@ def test_trajectories_that_are_no_answer_say_why() -> None:
     unsure = np.full(10, 0.8)
     assert "metric scale unknown (sigma 80%)" in str(ego_fault(motion(scale_sigma=unsure)))
     assert ego_fault(motion(scale_sigma=unsure, mode=np.full(10, "still"))) is None, "standing still needs no scale"
+
+
+def test_figures_that_the_truth_itself_fails_are_named() -> None:
+    def report(**floor: float) -> Any:
+        guess = {"truth_pck": 0.7, "ade_m": 1.0, "apd_m": 0.0}
+        sets = {FLOOR: floor, VELOCITY: guess}
+        return SimpleNamespace(
+            sets={
+                name: SimpleNamespace(figures={key: SimpleNamespace(mean=value) for key, value in means.items()})
+                for name, means in sets.items()
+            }
+        )
+
+    assert blind_ruler(report(truth_pck=0.9, ade_m=0.1, apd_m=0.3, ssim=0.1)) == []
+    (note,) = blind_ruler(report(truth_pck=0.4, ade_m=0.1, apd_m=0.3))
+    assert "points: RGB against truth:" in note and "ADE" not in note
+    assert "ADE" in blind_ruler(report(truth_pck=0.9, ade_m=1.1))[0]
+    assert blind_ruler(SimpleNamespace(sets={})) == []  # type: ignore[arg-type]
 
 
 def test_notes_say_what_was_left_out() -> None:
