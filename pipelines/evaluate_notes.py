@@ -120,6 +120,6 @@ def blind_ruler(report: Report) -> list[str]:
     if not worse:
         return []
     return [
-        f"the truth's own video is worse than constant velocity in {', '.join(worse)}: at this size videos are read too "
-        "badly for these figures to say much"
+        f"the truth's own video is worse than constant velocity in {', '.join(worse)}: at this size videos are read "
+        "too badly for these figures to say much"
     ]
