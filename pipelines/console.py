@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 from rich.markup import escape
@@ -55,9 +55,8 @@ class ConsoleReporter:
             self._progress = None
         if report.stage in ("source", "shards") and not report.failed:
             return
-        words = [f"{report.count('done')} done"]
-        dropped = reason_counts(receipt.reason for receipt in report.made if receipt.state == "dropped")
-        words += [f"{count} dropped ({reason})" for reason, count in dropped.items()]
+        words = selection_words(report.made) or [f"{report.count('done')} done"]
+        words += dropped_words(reason_counts(receipt.reason for receipt in report.made if receipt.state == "dropped"))
         words += [f"[red]{len(report.failed)} failed[/]"] if report.failed else []
         words += [f"{report.current} up to date"] if report.current else []
         words += left_out_words(report.made)
@@ -69,6 +68,17 @@ class ConsoleReporter:
         if text != message or time.monotonic() - at > 60:
             self.console.print(f"[yellow]waiting[/] {escape(message)}")
             self._notice = (message, time.monotonic())
+
+
+def selection_words(receipts: Sequence[Receipt]) -> list[str]:
+    """What a selection that was made keeps and drops: it is one item, whatever becomes of how many clips."""
+    made = [receipt.facts for receipt in receipts if receipt.stage == "select" and receipt.state == "done"]
+    return [words for facts in made for words in (f"{facts['kept']} kept", *dropped_words(facts["dropped"]))]
+
+
+def dropped_words(dropped: Mapping[str, int]) -> list[str]:
+    """``2 dropped (objects)``: a reason is a slug, and takes no plural."""
+    return [f"{count} dropped ({reason})" for reason, count in dropped.items()]
 
 
 def left_out_words(receipts: Sequence[Receipt]) -> list[str]:

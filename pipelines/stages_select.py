@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dataset.receipts import digest
+from dataset.receipts import digest, reason_counts
 from dataset.selection import (
     ClipRow,
     SelectionRule,
@@ -199,7 +199,10 @@ class SelectStage:
             rule_digest=_rule_digest(item), previous=_previous(root), mode=item.payload["mode"],
         )  # fmt: skip
         write_selection(staging / SELECTION, selection)
-        return {"clips": len(selection.rows), "kept": len(selection.kept), "threshold": selection.threshold}
+        return {
+            "clips": len(selection.rows), "kept": len(selection.kept), "threshold": selection.threshold,
+            "dropped": reason_counts(row.reason or "" for row in selection.rows if not row.kept),
+        }  # fmt: skip
 
 
 def refuse_extend(job: Job) -> None:

@@ -277,7 +277,7 @@ def test_a_job_of_which_nothing_is_left_says_why(run, config, tmp_path):
         "label", short, "--out", tmp_path / "J", "--config", config, "--keep-share", "1", "--workers", "0"
     )
     why = "no clip is left of 1: 1 too_short (short_0: too_short: frames=5 < clip_frames=9); give longer videos"
-    assert code == 1 and why in out
+    assert code == 1 and why in out and "select 0 kept, 1 dropped (too_short)" in out
     code, out, _ = run("status", tmp_path / "J")
     assert code == 1 and why in out and "everything is packed" not in out
     assert json.loads(run("status", tmp_path / "J", "--json")[1])["nothing_left"].startswith(why)
