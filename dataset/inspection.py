@@ -63,6 +63,7 @@ class Summary:
     clips: int
     """Of all indexed videos."""
     kept: int
+    """Selected and not dropped since: with those dropped, all."""
     packed: Mapping[str, int]
     """By split."""
     dropped: Mapping[str, int]
@@ -97,14 +98,15 @@ def summarize(job: Path) -> Summary:
     lengths = {row.key: row.end - row.start for row in selection.rows}
     splits = {row.key: row.split for row in rows}
     kept = {row.key for row in selection.kept}
+    dropped = _drop_reasons(selection, receipts["render"])
     rendered = [r for key, r in receipts["render"].items() if r.state == "done" and key in kept]
     return Summary(
         videos=sum(r.state == "done" for r in receipts["index"].values()),
         source_hours=sum(r.facts.get("seconds", 0.0) for r in receipts["index"].values()) / 3600,
         clip_hours=sum(lengths.get(key, 0) for key in splits) / _FPS / 3600,
-        clips=len(selection.rows), kept=len(selection.kept),
+        clips=len(selection.rows), kept=len(selection.rows) - len(dropped),
         packed={split: _count(splits, split) for split in ("train", "val")},
-        dropped=reason_counts(_drop_reasons(selection, receipts["render"]).values()), threshold=selection.threshold,
+        dropped=reason_counts(dropped.values()), threshold=selection.threshold,
         objects_per_clip=spread([row.objects for row in selection.rows if row.objects is not None]),
         tracks_per_clip=spread([r.facts["objects"] for r in rendered]),
         path_length_m=spread([r.facts["metres"] for r in rendered]),

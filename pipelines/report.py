@@ -23,10 +23,10 @@ from dataset.receipts import atomic_write
 from dataset.selection import Selection, read_selection
 from labeling.encoding import EncoderSettings, VideoWriter
 from labeling.errors import DataError
-from pipelines.console import counted, duration, file_size
+from pipelines.console import duration, file_size
 from pipelines.job import open_job
 from pipelines.layout import REPORT, SELECTION
-from pipelines.status import JobStatus, failure_lines, job_status
+from pipelines.status import JobStatus, failure_lines, job_status, videos_words
 
 _TEMPLATE = Path(__file__).with_name("templates") / "report.html"
 _QUARTER = (384, 256)
@@ -88,8 +88,7 @@ def write_report(root: Path, *, out: Path | None = None, extras: ReportExtras | 
     page = jinja2.Environment(autoescape=True).from_string(_TEMPLATE.read_text(encoding="utf-8"))
     html = page.render(
         title=extras.title or f"Animatic: {root.name}",
-        subtitle=f"{counted(summary.videos, 'source video')}, {summary.source_hours:.3g} h, labelled by animatic "
-        f"{_version()}",
+        subtitle=f"{videos_words(root, summary)}, {summary.source_hours:.3g} h, labelled by animatic {_version()}",
         cards=[{"name": name, "value": value} for name, value in {**_cards(summary), **extras.cards}.items()],
         sections=[*_label_sections(root, status, summary), *extras.sections, _settings_section(root)],
         footer=f"next: {status.next_command} ({status.next_reason})",

@@ -9,14 +9,14 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from dataset.inspection import Spread, Summary, clip_record, contact_sheet, find_sample, summarize
+from dataset.inspection import Spread, Summary, clip_record, contact_sheet, drop_reasons, find_sample, summarize
 from dataset.loader import ShardDataset
 from dataset.pictures import write_picture
 from dataset.receipts import read_receipts, reason_counts
 from dataset.selection import read_selection
 from labeling.errors import AnimaticError, ConfigError, DataError
 from pipelines.black_skeletons import print_black_skeletons
-from pipelines.console import counted, file_size, make_console, print_damaged, shortened
+from pipelines.console import counted, dropped_words, file_size, make_console, print_damaged, shortened
 from pipelines.damage import damaged_videos
 from pipelines.job import Job, open_job
 from pipelines.layout import SELECTION, SHARD_INDEX
@@ -52,7 +52,7 @@ class JobStatus:
     videos: int
     stages: tuple[StageStatus, ...]
     clips: Mapping[str, int]
-    """Clips kept and dropped by the selection, by reason."""
+    """Clips that are still kept, and those dropped, by the selection or when they were to be drawn, by reason."""
     damaged: tuple[str, ...]
     """Videos that are less than they claim, with what they lack."""
     nothing_left: str
@@ -100,11 +100,10 @@ def stage_status(job: Job, name: str) -> StageStatus:
 
 def _selected(root: Path) -> dict[str, int]:
     try:
-        rows = read_selection(root / SELECTION).rows
+        rows, reasons = read_selection(root / SELECTION).rows, drop_reasons(root)
     except DataError:
         return {}
-    dropped = reason_counts(row.reason or "" for row in rows if not row.kept)
-    return {"kept": sum(row.kept for row in rows), **dropped}
+    return {"kept": len(rows) - len(reasons), **reason_counts(reasons.values())}
 
 
 def _is_through(stages: tuple[StageStatus, ...]) -> bool:
@@ -158,7 +157,8 @@ def print_status(root: Path, *, as_json: bool = False) -> int:
         )  # fmt: skip
     console.print(table)
     if status.clips:
-        console.print("clips: " + ", ".join(_verdicts(status.clips)))
+        dropped = {name: count for name, count in status.clips.items() if name != "kept"}
+        console.print("clips: " + ", ".join([f"{status.clips['kept']} kept", *dropped_words(dropped)]))
     for line in failure_lines(root):
         console.print(f"[red]{escape(line)}[/]")
     print_damaged(status.damaged, console, most=20)
@@ -167,11 +167,6 @@ def print_status(root: Path, *, as_json: bool = False) -> int:
         console.print(f"[red]{escape(status.nothing_left)}[/]")
     console.print(f"next: [bold]{escape(status.next_command)}[/]  [dim]({escape(status.next_reason)})[/]")
     return int(failed)
-
-
-def _verdicts(clips: Mapping[str, int]) -> list[str]:
-    """``1 kept, 1 dropped (objects)``: a reason is a slug, and takes no plural."""
-    return [f"{count} kept" if name == "kept" else f"{count} dropped ({name})" for name, count in clips.items()]
 
 
 def _words(counts: Mapping[str, int], ending: str = "") -> list[str]:
@@ -239,10 +234,10 @@ def _print_summary(root: Path, summary: Summary) -> None:
     table = Table(title=str(root), title_justify="left", show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
-    rule = f"at least {summary.threshold:.3g} objects" if summary.threshold is not None else "every clip"
+    rule = f"at least {summary.threshold:.3g} objects" if summary.threshold is not None else "no threshold"
     kept = f"kept {summary.kept} ({rule})" if summary.kept else "none kept"
     rows = {
-        "source": f"{counted(summary.videos, 'video')}, {summary.source_hours:.3g} h",
+        "source": f"{videos_words(root, summary)}, {summary.source_hours:.3g} h",
         "clips": f"{summary.clips}, {kept}, packed {sum(summary.packed.values())} "
         f"({', '.join(f'{count} {split}' for split, count in summary.packed.items())}), {summary.clip_hours:.3g} h",
         "dropped": ", ".join(f"{count} {reason}" for reason, count in summary.dropped.items()) or "none",
@@ -262,6 +257,14 @@ def _print_summary(root: Path, summary: Summary) -> None:
         console.print(f"one clip: [bold]animatic inspect {root} {_some_key(root)} --sheet sheet.png[/]")
     elif not summary.kept or (root / SHARD_INDEX).is_file():
         console.print(f"[red]{escape(why_nothing_is_left(root))}[/]")
+
+
+def videos_words(root: Path, summary: Summary) -> str:
+    """How many videos a job has, and of how many of them the summary is."""
+    videos = len(open_job(root).sources) if (root / "job.yaml").is_file() else summary.videos
+    if videos <= summary.videos:
+        return counted(summary.videos, "video")
+    return f"{counted(videos, 'video')}, {summary.videos} of them indexed"
 
 
 def _spread_text(found: Spread | None, unit: str) -> str:

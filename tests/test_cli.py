@@ -159,7 +159,7 @@ def test_a_finished_job_is_labelled_again_at_once(run, job):
 
 def test_inspect_gives_a_summary_a_record_and_a_sheet(run, job, tmp_path):
     code, out, _ = run("inspect", job)
-    assert code == 0 and "kept 2 (every clip), packed 2" in out and "1 video, " in out
+    assert code == 0 and "2, kept 2 (no threshold), packed 2" in out and "1 video, " in out
     code, out, _ = run("inspect", job, "street_8", "--json", "--sheet", tmp_path / "s.png")
     record = json.loads(out)
     assert (code, record["key"], record["start"]) == (0, "street_8", 8)
@@ -266,6 +266,7 @@ def test_one_bad_video_ends_with_exit_code_1_and_its_reason(run, video, config, 
     assert code == 1 and "bad.mp4" in out and "pack 1 done" in out
     code, out, _ = run("status", root)
     assert code == 1 and "1 video" in out and "bad.mp4" in out
+    assert "2 videos, 1 of them indexed" in run("inspect", root)[1]
     # It stays bad until it changes, and says so again.
     code, out, _ = run("label", "--out", root, "--workers", "0")
     assert code == 1 and "bad.mp4" in out
@@ -294,7 +295,9 @@ def test_a_job_whose_kept_clips_are_all_dropped_later_says_why(run, job, tmp_pat
     for command in (["label", "--out", root, "--workers", "0"], ["status", root], ["pack", "-o", root]):
         code, out, _ = run(*command)
         assert code == 1 and why in out and "import trajectories that cover the videos" in out, command
-    assert why in run("inspect", root)[1]
+    inspected = run("inspect", root)[1]
+    assert why in inspected and "2, none kept" in inspected
+    assert "clips: 0 kept, 2 dropped (no_trajectory)" in run("status", root)[1]
 
 
 def bad_yaml(tmp_path, text):

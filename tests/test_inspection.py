@@ -64,7 +64,7 @@ def members(root):
 def test_a_summary_counts_what_there_is(job):
     summary = summarize(job)
     assert (summary.videos, summary.source_hours) == (1, 2.0)
-    assert (summary.clips, summary.kept, summary.packed) == (3, 2, {"train": 1, "val": 0})
+    assert (summary.clips, summary.kept, summary.packed) == (3, 1, {"train": 1, "val": 0})
     assert summary.dropped == {"cut": 1, "objects": 1}
     assert summary.failed == {"corners": 1, "index": 1}
     assert summary.objects_per_clip and summary.tracks_per_clip and summary.path_length_m
