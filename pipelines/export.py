@@ -8,6 +8,7 @@ from dataset.receipts import atomic_write
 from labeling.errors import ConfigError
 from pipelines.black_skeletons import print_black_skeletons
 from pipelines.console import counted, make_console
+from pipelines.sources import absolute
 
 
 def export_released(job: Path, out: Path, *, split: str = "train") -> int:
@@ -25,6 +26,7 @@ def export_released(job: Path, out: Path, *, split: str = "train") -> int:
     dataset = ShardDataset(job, split)
     if not len(dataset):
         raise ConfigError(f"{job}: its {split} split is empty; export the other, or label more source videos")
+    out = absolute(out)
     lines = [json.dumps(_export_clip(sample, out)) for sample in dataset]
     manifest = out / f"{split}.jsonl"
     atomic_write(manifest, ("\n".join(lines) + "\n").encode())
@@ -37,7 +39,7 @@ def _export_clip(sample: Sample, out: Path) -> dict[str, str]:
     paths = {"rgb_path": ("rgb", "rgb.mp4"), "pose_path": ("pose", "skeleton.mp4")}
     record = {"id": sample.key, "caption": sample.caption}
     for name, (folder, suffix) in paths.items():
-        target = out.absolute() / folder / f"{sample.key}.mp4"
+        target = out / folder / f"{sample.key}.mp4"
         data = sample.member(suffix)
         if not target.is_file() or target.read_bytes() != data:
             atomic_write(target, data)

@@ -180,9 +180,10 @@ def test_a_clip_that_is_not_there_is_named(run, job, tmp_path):
 
 
 def test_the_released_trainer_s_manifest(run, job, tmp_path):
-    code, _, _ = run("export", "released", job, "--out", tmp_path)
+    code, _, _ = run("export", "released", job, "--out", tmp_path / "x" / "..")
     lines = [json.loads(line) for line in (tmp_path / "train.jsonl").read_text().splitlines()]
     assert code == 0 and [line["id"] for line in lines] == ["street_0", "street_8"]
+    assert [line["rgb_path"] for line in lines] == [str(tmp_path / f"rgb/{line['id']}.mp4") for line in lines]
     from labeling.video import frame_count
 
     assert all(set(line) == {"id", "caption", "rgb_path", "pose_path"} for line in lines)
