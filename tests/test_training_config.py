@@ -131,6 +131,15 @@ def test_dry_run_needs_neither_data_nor_weights_and_says_all(tmp_path: Path) -> 
     assert not (tmp_path / "out").exists()
 
 
+def test_dry_run_of_a_tiny_network_says_no_zeros() -> None:
+    plan = plan_run(load_config("tiny", stage="motion"), steps_per_second=2)
+    values = dict(plan.rows())
+    assert (values["frozen parameters"], values["trained parameters"]) == ("202.6 k", "26.62 k")
+    assert "MiB: " in values["memory per GPU (estimate)"] and values["work per step"].endswith(" GFLOP")
+    assert values["at the given rate"] == "7,200 steps per hour, 20.0 s in all"
+    assert not {"0.0", "0.00"} & set(" ".join(values.values()).split())
+
+
 def test_a_plan_of_own_weights_needs_their_size() -> None:
     own = {"backbone": {"name": "mine", "kind": "ltx", "weights": "/w/ltx"}, "optimiser": {"steps": 10}}
     with pytest.raises(ConfigError, match="does not say how large /w/ltx is.*backbone.size to 2b or 13b"):

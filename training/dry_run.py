@@ -4,6 +4,7 @@ Memory is an estimate: exact for weights, adapters, gradients and AdamW's moment
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,9 @@ _PEAK_PER_TOKEN = 60
 """Activations of one block while it is recomputed, in hidden sizes: six modulations, q, k, v, rotary copies in float32,
 the feed-forward's four-fold layer twice, and the adapters' float32 inputs."""
 _RELEASED_FRAMES = 121
+_COUNTS = {1: "", 1e3: "k", 1e6: "M", 1e9: "B"}
+_WORK = {1e6: "MFLOP", 1e9: "GFLOP", 1e12: "TFLOP", 1e15: "PFLOP"}
+_TIMES = {3600: "h", 60: "min", 1: "s"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,22 +68,38 @@ class RunPlan:
         """As a table of two columns."""
         rows = [
             ("recipe", f"{self.name}: {self.stage} on {self.backbone}"),
-            ("frozen parameters", f"{self.base_parameters / 1e9:.2f} B"),
-            ("trained parameters", f"{self.trainable_parameters / 1e6:.1f} M"),
+            ("frozen parameters", _scaled(self.base_parameters, _COUNTS)),
+            ("trained parameters", _scaled(self.trainable_parameters, _COUNTS)),
             ("tokens of the target", f"{self.target_tokens:,}"),
             ("tokens per sample", f"{self.mean_tokens:,.0f} on average, {self.most_tokens:,} at most"),
             ("noise shift", f"{self.noise_shift:.2f}"),
             ("memory per GPU (estimate)", (
-                f"{self.memory_gib:.1f} GiB: {self.weights_gib:.1f} weights, {self.adapter_gib:.1f} adapter and "
-                f"optimiser, {self.activations_gib:.1f} activations")),
+                f"{_memory(self.memory_gib)}: {_memory(self.weights_gib)} weights, {_memory(self.adapter_gib)} adapter "
+                f"and optimiser, {_memory(self.activations_gib)} activations")),
             ("steps", f"{self.steps:,} of {self.global_batch} samples, {self.samples:,} samples in all"),
-            ("work per step", f"{self.petaflops_per_step:.2f} PFLOP"),
+            ("work per step", _scaled(self.petaflops_per_step * 1e15, _WORK)),
         ]  # fmt: skip
         if self.hours is not None:
             rows.append(
-                ("at the given rate", f"{self.steps / self.hours:,.0f} steps per hour, {self.hours:.1f} h in all")
+                ("at the given rate", f"{self.steps / self.hours:,.0f} steps per hour, {_time(self.hours)} in all")
             )
         return rows
+
+
+def _scaled(value: float, units: Mapping[float, str]) -> str:
+    """A number with the greatest unit that it reaches."""
+    size = next((size for size in sorted(units, reverse=True) if value >= size), min(units))
+    shown = value / size
+    return f"{shown:.{0 if size == 1 else 2 if shown < 100 else 1}f} {units[size]}".rstrip()
+
+
+def _memory(gib: float) -> str:
+    return f"{gib:.1f} GiB" if gib >= 1 else f"{gib * 2**10:.1f} MiB"
+
+
+def _time(hours: float) -> str:
+    seconds = hours * 3600
+    return next(f"{seconds / size:.1f} {unit}" for size, unit in _TIMES.items() if seconds >= size or size == 1)
 
 
 def plan_run(config: TrainConfig, *, steps_per_second: float | None = None) -> RunPlan:
