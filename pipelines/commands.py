@@ -200,11 +200,7 @@ def read_split(path: Path) -> dict[str, str]:
     Raises:
         ConfigError: it cannot be read, or lacks a column.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            return {row["video_id"]: row["split"] for row in csv.DictReader(stream)}
-    except (OSError, KeyError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path}: cannot be read as video_id,split ({error}); mend the table") from error
+    return {row["video_id"]: row["split"] for _, row in _table_rows(path, needs=("video_id", "split"))}
 
 
 def read_cameras(path: Path) -> dict[str, dict[str, float]]:
@@ -214,16 +210,39 @@ def read_cameras(path: Path) -> dict[str, dict[str, float]]:
     Raises:
         ConfigError: it cannot be read, lacks ``video_id``, or holds something that is no number.
     """
+    cameras: dict[str, dict[str, float]] = {}
+    for place, row in _table_rows(path, needs=("video_id",)):
+        cells = {name: cell for name, cell in row.items() if name != "video_id" and cell}
+        cameras[row["video_id"]] = {name: _number(cell, f"{place}: {name}") for name, cell in cells.items()}
+    return cameras
+
+
+def _table_rows(path: Path, *, needs: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
+    """The rows of a CSV table, each with the words that say where it stands.
+
+    Raises:
+        ConfigError: it cannot be read, lacks a column of ``needs``, or a row's cells do not fit the columns.
+    """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
-            return {
-                row.pop("video_id"): {name: float(cell) for name, cell in row.items() if cell}
-                for row in csv.DictReader(stream)
-            }
-    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
-        raise ConfigError(
-            f"{path}: cannot be read as video_id,fx,fy,cx,cy,height_m,pitch_deg ({error}); mend the table"
-        ) from error
+            reader = csv.DictReader(stream)
+            rows, columns = [(reader.line_num, row) for row in reader], reader.fieldnames or ()
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path}: cannot be read as a CSV table ({error}); mend the table") from error
+    for name in needs:
+        if name not in columns:
+            raise ConfigError(f"{path}: has no column {name}; its columns are {', '.join(columns) or 'none'}; add it")
+    for line, row in rows:
+        if None in row or None in (row[name] for name in needs):
+            raise ConfigError(f"{path}: line {line} does not fit the columns {', '.join(columns)}; mend the table")
+    return [(f"{path}: line {line} (video {row['video_id']})", row) for line, row in rows]
+
+
+def _number(cell: str, place: str) -> float:
+    try:
+        return float(cell)
+    except ValueError as error:
+        raise ConfigError(f"{place} is {cell!r}, but must be a number; leave it empty if it is not known") from error
 
 
 def check_extractors(job: Job, reporter: ConsoleReporter) -> None:

@@ -22,7 +22,7 @@ from labeling.ego_tracks import RunTracks, StoredTracks
 from labeling.encoding import EncoderSettings, VideoWriter
 from labeling.errors import ConfigError, DataError, TrajectoryError
 from labeling.video import probe
-from pipelines.commands import read_cameras
+from pipelines.commands import read_cameras, read_split
 from pipelines.config import CameraSettings, Config, parse_config, video_camera
 from pipelines.job import Job
 from pipelines.sources import Source
@@ -137,9 +137,32 @@ def test_a_table_of_cameras(tmp_path):
     path = tmp_path / "cameras.csv"
     path.write_text("video_id,fx,height_m\na,700,\nb,,1.3\n")
     assert read_cameras(path) == {"a": {"fx": 700}, "b": {"height_m": 1.3}}
-    path.write_text("video_id,fx\na,wide\n")
-    with pytest.raises(ConfigError, match="mend the table"):
+    with pytest.raises(ConfigError, match="none.csv: cannot be read as a CSV table"):
+        read_cameras(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("video_id,fx\na,1\nb,wide\n", r"line 3 \(video b\): fx is 'wide', but must be a number"),
+        ("video,fx\na,1\n", "has no column video_id; its columns are video, fx; add it"),
+        ("", "has no column video_id; its columns are none"),
+        ("video_id,fx\na,1,2\n", "line 2 does not fit the columns video_id, fx; mend the table"),
+        ("fx,video_id\n1\n", "line 2 does not fit the columns fx, video_id; mend the table"),
+    ],
+)
+def test_a_faulty_table_of_cameras_says_where_and_what(tmp_path, text, message):
+    path = tmp_path / "cameras.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
         read_cameras(path)
+
+
+def test_a_table_of_splits_needs_its_column(tmp_path):
+    path = tmp_path / "split.csv"
+    path.write_text("video_id,part\na,val\n")
+    with pytest.raises(ConfigError, match="has no column split; its columns are video_id, part"):
+        read_split(path)
 
 
 @pytest.mark.parametrize(
