@@ -1,5 +1,8 @@
 """What is wrong with settings, in words: the field, the value, and what is allowed."""
 
+import math
+from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -29,18 +32,26 @@ def settings_faults(model: type[BaseModel], error: ValidationError) -> str:
 def _fault(model: type[BaseModel], fault: Any) -> str:
     place, kind = ".".join(str(part) for part in fault["loc"]) or "settings", fault["type"]
     if kind == "extra_forbidden":
-        return f"{place} is not a setting; choose one of {_neighbours(model, fault['loc'])}"
+        return f"{place} is not a setting; {_advice(str(fault['loc'][-1]), _neighbours(model, fault['loc']))}"
     if kind == "missing":
         return f"{place} is missing; it has no default, so give it"
+    if isinstance(fault["input"], float) and math.isnan(fault["input"]):
+        return f"{place} is nan, but must be a number"
     if kind in _ALLOWED:
         return f"{place} is {fault['input']!r}, but must {_ALLOWED[kind].format(**fault.get('ctx', {}))}"
     return f"{place}: {fault['msg'].lower().removeprefix('value error, ')}, got {fault['input']!r}"
 
 
-def _neighbours(model: type[BaseModel], place: tuple[int | str, ...]) -> str:
+def _advice(name: str, known: Sequence[str]) -> str:
+    """What to write instead of an unknown field: what it may have been meant to be, and all that there are."""
+    meant = " or ".join(get_close_matches(name, known, n=2, cutoff=0.7))
+    return (f"did you mean {meant}? " if meant else "") + f"choose one of {', '.join(known) or 'none'}"
+
+
+def _neighbours(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
     """The fields that there are where an unknown one was given."""
     known: Any = model
     for part in place[:-1]:
         fields = getattr(known, "model_fields", {})
         known = fields[part].annotation if part in fields else None
-    return ", ".join(getattr(known, "model_fields", ())) or "none"
+    return list(getattr(known, "model_fields", ()))

@@ -39,8 +39,11 @@ def test_the_papers_recipe() -> None:
     [
         (
             "backbone: tiny\noptimiser: {steps: 3, lerning_rate: 1}",
-            "optimiser.lerning_rate is not a setting; choose one of learning_rate",
+            r"optimiser.lerning_rate is not a setting; did you mean learning_rate\? choose one of learning_rate",
         ),
+        ("backbone: tiny\noptimizer: {steps: 3}", r"optimizer is not a setting; did you mean optimiser\? choose"),
+        ("backbone: tiny\nzebra: 1\noptimiser: {steps: 3}", "zebra is not a setting; choose one of"),
+        ("backbone: tiny\noptimiser: {steps: 3, learning_rate: .nan}", "learning_rate is nan, but must be a number$"),
         ("backbone: tinny\noptimiser: {steps: 3}", "backbone: not a preset; choose one of tiny, .*'tinny'"),
         ("backbone: tiny\noptimiser: {steps: 0}", "c.yaml: optimiser.steps is 0, but must be 1 or more$"),
         ("backbone: tiny\noptimiser: {steps: three}", "optimiser.steps is 'three', but must be a whole number"),
@@ -59,6 +62,9 @@ def test_the_papers_recipe() -> None:
     ],
     ids=[
         "unknown key",
+        "misspelt",
+        "unknown and far",
+        "nan",
         "unknown backbone",
         "no steps",
         "not whole",
