@@ -123,6 +123,9 @@ def write_trajectory_picture(job: Path, key: str, path: Path) -> None:
     Raises:
         DataError: no such clip, no trajectory yet, or a picture that cannot be written.
     """
+    if not path.suffix:
+        # Matplotlib would write a PNG under a name of its own.
+        raise DataError(f"{path}: is no picture's name; end it in .png")
     figure = draw_trajectory(clip_motion(job, key), title=key)
     try:
         figure.savefig(path)

@@ -136,5 +136,8 @@ def test_a_picture_that_cannot_be_written_is_an_error(job, tmp_path):
     assert (tmp_path / "t.png").stat().st_size > 10_000
     with pytest.raises(DataError, match="end it in .png"):
         write_trajectory_picture(job, "v_56", tmp_path / "t.nonsense")
+    with pytest.raises(DataError, match="way: is no picture's name; end it in .png"):
+        write_trajectory_picture(job, "v_56", tmp_path / "way")
+    assert [path.name for path in tmp_path.iterdir()] == ["t.png"]
     with pytest.raises(DataError, match="folder that is there"):
         write_trajectory_picture(job, "v_56", tmp_path / "none" / "t.png")
