@@ -139,6 +139,7 @@ def prepare_job(
     """
     if options.part is not None:
         parse_part(options.part)
+    _refuse_file(out)
     sources = find_videos(videos, out=out) if videos else []
     job = open_or_create(out, videos=sources, models_dir=options.models, leave_out=options.leave_out)
     config = configured(job.config, options)
@@ -150,6 +151,13 @@ def prepare_job(
     make_folder(out)
     job.save()
     return job
+
+
+def _refuse_file(out: Path) -> None:
+    """Before networks are opened: a folder cannot be made where, or below where, a file lies."""
+    there = next((place for place in (out, *out.parents) if os.path.exists(place)), None)
+    if there is not None and not there.is_dir():
+        raise ConfigError(f"--out {out}: {there} is a file; give a folder that can be written to")
 
 
 def _check_tables(config: Config, video_ids: Sequence[str]) -> None:

@@ -384,6 +384,13 @@ def in_the_way(folder):
     return folder / "file"
 
 
+@pytest.mark.parametrize("below", ["", "J/K"], ids=["itself", "above"])
+def test_a_file_in_the_folder_s_place_is_said_before_models_are_opened(run, video, tmp_path, below):
+    models = spoilt(tmp_path, None)
+    code, out, err = run("label", video, "-o", in_the_way(tmp_path) / below, "--models", models)
+    assert code == 2 and f"{tmp_path / 'file'} is a file; give a folder" in err and not out
+
+
 def test_a_list_of_paths_with_ids(run, video, config, tmp_path):
     listed = tmp_path / "videos.txt"
     listed.write_text(f"# two of them\nmine\t{video}\n\n{video}\n")
