@@ -155,7 +155,7 @@ def prepare_job(
 
 def _refuse_file(out: Path) -> None:
     """Before networks are opened: a folder cannot be made where, or below where, a file lies."""
-    there = next((place for place in (out, *out.parents) if os.path.exists(place)), None)
+    there = next((place for place in (out, *out.parents) if place.exists()), None)
     if there is not None and not there.is_dir():
         raise ConfigError(f"--out {out}: {there} is a file; give a folder that can be written to")
 
