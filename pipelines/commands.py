@@ -229,7 +229,8 @@ def _table_rows(path: Path, *, needs: Sequence[str]) -> list[tuple[str, dict[str
     """The rows of a CSV table, each with the words that say where it stands.
 
     Raises:
-        ConfigError: it cannot be read, lacks a column of ``needs``, or a row's cells do not fit the columns.
+        ConfigError: it cannot be read, lacks a column of ``needs``, a row's cells do not fit the columns, or a video has
+            two rows.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -240,9 +241,13 @@ def _table_rows(path: Path, *, needs: Sequence[str]) -> list[tuple[str, dict[str
     for name in needs:
         if name not in columns:
             raise ConfigError(f"{path}: has no column {name}; its columns are {', '.join(columns) or 'none'}; add it")
+    seen: set[str] = set()
     for line, row in rows:
         if None in row or None in (row[name] for name in needs):
             raise ConfigError(f"{path}: line {line} does not fit the columns {', '.join(columns)}; mend the table")
+        if row["video_id"] in seen:
+            raise ConfigError(f"{path}: line {line} names video {row['video_id']} again; keep one of its lines")
+        seen.add(row["video_id"])
     return [(f"{path}: line {line} (video {row['video_id']})", row) for line, row in rows]
 
 

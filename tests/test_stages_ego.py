@@ -147,6 +147,7 @@ def test_a_table_of_cameras(tmp_path):
         ("video_id,fx\na,1\nb,wide\n", r"line 3 \(video b\): fx is 'wide', but must be a number"),
         ("video,fx\na,1\n", "has no column video_id; its columns are video, fx; add it"),
         ("", "has no column video_id; its columns are none"),
+        ("video_id,fx\na,1\nb,2\na,3\n", "line 4 names video a again; keep one of its lines"),
         ("video_id,fx\na,1,2\n", "line 2 does not fit the columns video_id, fx; mend the table"),
         ("fx,video_id\n1\n", "line 2 does not fit the columns fx, video_id; mend the table"),
     ],
