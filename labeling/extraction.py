@@ -105,8 +105,13 @@ def label_with(
 
 
 def _pace(moments: Sequence[int]) -> int:
-    """For how many frames a picture is usually shown: more than one where the source has fewer than the grid."""
-    return int(np.median(np.diff(moments))) if len(moments) > 1 else 1
+    """For how many frames a picture is usually shown: more than one where the source has fewer than the grid.
+
+    One gap tells nothing, since a camera that stands at a run's start shows one picture for long; of two the lesser
+    does.
+    """
+    gaps = np.sort(np.diff(moments))
+    return int(gaps[(len(gaps) - 1) // 2]) if len(gaps) > 1 else 1
 
 
 def without_doubles(labels: Iterable[Keypoints]) -> list[Keypoints]:

@@ -229,8 +229,8 @@ def _table_rows(path: Path, *, needs: Sequence[str]) -> list[tuple[str, dict[str
     """The rows of a CSV table, each with the words that say where it stands.
 
     Raises:
-        ConfigError: it cannot be read, lacks a column of ``needs``, has a row whose cells do not fit the columns, or two
-            rows of one video.
+        ConfigError: it cannot be read, lacks a column of ``needs``, has a row whose cells do not fit, or two rows of a
+            video.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:

@@ -200,6 +200,13 @@ def test_sources_of_fewer_frames_show_nothing_long_unseen(effort: Effort, every:
         assert max(np.diff(scene.seen)) <= EFFORTS[effort].max_gap + every
 
 
+def test_a_picture_that_is_held_at_the_start_makes_no_slow_source() -> None:
+    scene = MovingCard(speed=0.5)
+    label_with([scene], (scene.render(max(0, t - 8)) for t in range(40)), first_frame=0, effort="balanced")
+    # Frame 9 is the second moment; looks begin four moments apart.
+    assert scene.seen[:2] == [0, 12]
+
+
 def test_a_source_of_fewer_frames_is_smoothed_over_the_same_time() -> None:
     assert SmoothingSettings().at_pace(1) == SmoothingSettings()
     assert SmoothingSettings(narrow=5, wide=12, fill_frames=6).at_pace(2) == SmoothingSettings(

@@ -37,3 +37,14 @@ def test_pictures_with_nothing_in_common_turn_nothing() -> None:
     rng = np.random.default_rng(0)
     views = [turn_view(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)) for _ in range(2)]
     np.testing.assert_array_equal(picture_turn(*views, width=WIDTH, height=HEIGHT), np.eye(3))
+
+
+def test_views_can_be_compared_again() -> None:
+    """OpenCV's phase correlation multiplies its inputs by the window where they lie; views are shared."""
+    rng = np.random.default_rng(3)
+    frame = cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8), (0, 0), 6)
+    before, after = turn_view(frame), turn_view(np.roll(frame, 24, axis=1))
+    kept = before.copy(), after.copy()
+    first = picture_turn(before, after, width=WIDTH, height=HEIGHT)
+    assert np.array_equal(before, kept[0]) and np.array_equal(after, kept[1])
+    assert np.array_equal(picture_turn(before, after, width=WIDTH, height=HEIGHT), first)
