@@ -224,7 +224,7 @@ def test_what_is_missing_or_wrong_is_named(generator, adapters, tmp_path: Path, 
     from labeling import extractors
 
     monkeypatch.setattr(extractors, "find_weights", lambda *_: None)
-    with pytest.raises(ConfigError, match="no extractors"):
+    with pytest.raises(ConfigError, match="no keypoint extractors"):
         generate(image=IMAGE, caption="x", out=tmp_path, **two_stages(adapters))
 
 
