@@ -34,10 +34,10 @@ def picture_turn(before: np.ndarray, after: np.ndarray, *, width: int, height: i
         width: of the frames, pixels.
         height: of the frames, pixels.
     """
-    # Squared, a Hann window leaves more of what enters and leaves out: a twelfth less error on turning streets.
+    # OpenCV multiplies what it is given by a window where it lies, and views are compared more than once. Squared, a
+    # Hann window leaves more of what enters and leaves out.
     window = cv2.createHanningWindow(_VIEW_SIZE, cv2.CV_32F) ** 2
-    # OpenCV writes into what it is given where no padding is needed, and views are compared more than once.
-    shift, response = cv2.phaseCorrelate(before.copy(), after.copy(), window)
+    shift, response = cv2.phaseCorrelate(before * window, after * window)
     if response < _LEAST_RESPONSE:
         return np.eye(3)
     camera = prior_intrinsics(width, height)

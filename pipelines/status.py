@@ -22,7 +22,7 @@ from pipelines.job import Job, open_job
 from pipelines.layout import SELECTION, SHARD_INDEX
 from pipelines.next_training import next_training
 from pipelines.nothing_left import clips_packed, why_nothing_is_left
-from pipelines.stage import COMMAND_STAGES, NotReadyError, item_state
+from pipelines.stage import COMMAND_STAGES, item_state
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,8 +82,6 @@ def stage_status(job: Job, name: str) -> StageStatus:
     known = job.receipts(name)
     try:
         items = job.plan(name)
-    except NotReadyError as error:
-        return StageStatus(stage=name, items=None, waits_for=str(error))
     except AnimaticError as error:
         return StageStatus(stage=name, items=None, waits_for=str(error))
     states = {item.name: item_state(item, known.get(item.name), job.root) for item in items}

@@ -19,7 +19,7 @@ from peft import LoraConfig, inject_adapter_in_model
 from peft.tuners.tuners_utils import BaseTunerLayer
 
 from labeling.errors import ModelError
-from training.adapter_notes import OUR_METADATA, notes, open_adapter
+from training.adapter_notes import OUR_METADATA, adapter_file, notes, open_adapter
 from training.config import AdapterConfig
 from training.weights import tensor_bytes
 
@@ -170,7 +170,7 @@ def read_adapter(path: Path) -> AdapterFile:
         ModelError: missing, not safetensors, without a LoRA in it, or one of a kind that would act at another scale:
             rank-stabilised, DoRA, alphas that differ from module to module.
     """
-    path = path / "adapter.safetensors" if path.is_dir() else path
+    path = adapter_file(path)
     with open_adapter(path, framework="pt") as file:
         metadata = file.metadata() or {}
         raw = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
