@@ -1,6 +1,5 @@
 """What the labelling commands do: settings from options, a job, its stages, and an exit code."""
 
-import csv
 import os
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, w
 from pipelines.console import ConsoleReporter, counted, print_damaged, print_failures
 from pipelines.damage import damaged_videos
 from pipelines.engine import Engine
+from pipelines.given_tables import read_cameras, read_split
 from pipelines.imports import import_trajectories
 from pipelines.job import Job, open_job, open_or_create
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
@@ -200,62 +200,6 @@ def configured(config: Config, options: JobOptions) -> Config:
     if config.views.captions is not None:
         read_caption_table(Path(config.views.captions))
     return config
-
-
-def read_split(path: Path) -> dict[str, str]:
-    """Split by video id, from a CSV table with the columns ``video_id, split``.
-
-    Raises:
-        ConfigError: it cannot be read, or lacks a column.
-    """
-    return {row["video_id"]: row["split"] for _, row in _table_rows(path, needs=("video_id", "split"))}
-
-
-def read_cameras(path: Path) -> dict[str, dict[str, float]]:
-    """What is known of each video's camera, from a CSV table with the column ``video_id`` and any of those of
-    ``CameraSettings`` (fx, fy, cx, cy, focal_sigma, height_m, pitch_deg); empty cells are not known.
-
-    Raises:
-        ConfigError: it cannot be read, lacks ``video_id``, or holds something that is no number.
-    """
-    cameras: dict[str, dict[str, float]] = {}
-    for place, row in _table_rows(path, needs=("video_id",)):
-        cells = {name: cell for name, cell in row.items() if name != "video_id" and cell}
-        cameras[row["video_id"]] = {name: _number(cell, f"{place}: {name}") for name, cell in cells.items()}
-    return cameras
-
-
-def _table_rows(path: Path, *, needs: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
-    """The rows of a CSV table, each with the words that say where it stands.
-
-    Raises:
-        ConfigError: it cannot be read, lacks a column of ``needs``, has a row whose cells do not fit, or two rows of a
-            video.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream)
-            rows, columns = [(reader.line_num, row) for row in reader], reader.fieldnames or ()
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path}: cannot be read as a CSV table ({error}); mend the table") from error
-    for name in needs:
-        if name not in columns:
-            raise ConfigError(f"{path}: has no column {name}; its columns are {', '.join(columns) or 'none'}; add it")
-    seen: set[str] = set()
-    for line, row in rows:
-        if None in row or None in (row[name] for name in needs):
-            raise ConfigError(f"{path}: line {line} does not fit the columns {', '.join(columns)}; mend the table")
-        if row["video_id"] in seen:
-            raise ConfigError(f"{path}: line {line} names video {row['video_id']} again; keep one of its lines")
-        seen.add(row["video_id"])
-    return [(f"{path}: line {line} (video {row['video_id']})", row) for line, row in rows]
-
-
-def _number(cell: str, place: str) -> float:
-    try:
-        return float(cell)
-    except ValueError as error:
-        raise ConfigError(f"{place} is {cell!r}, but must be a number; leave it empty if it is not known") from error
 
 
 def check_extractors(job: Job, reporter: ConsoleReporter) -> None:

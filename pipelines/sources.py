@@ -1,7 +1,5 @@
 """The source videos of a job: how a person names them, and how ``job.yaml`` keeps them."""
 
-import csv
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -10,6 +8,7 @@ from typing import Any
 
 from labeling.errors import ConfigError
 from labeling.timeline import LONGEST_VIDEO_ID, check_video_id
+from pipelines.given_tables import read_leave_out, two_lengths
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v", ".ts", ".mts", ".mpg", ".mpeg", ".flv"})
 _LIST_SUFFIXES = frozenset({".txt", ".lst", ".list", ".tsv"})
@@ -48,9 +47,7 @@ def read_source(job_file: Path, video_id: Any, entry: Any) -> Source:
     """
     try:
         check_video_id(video_id)
-        leave_out_s = _pair(entry.get("leave_out_s", (0, 0)))
-        if not _are_lengths(leave_out_s):
-            raise ValueError(f"leave_out_s holds {leave_out_s}, no two lengths of time")
+        leave_out_s = two_lengths(*entry.get("leave_out_s", (0, 0)))
         trajectory = ImportedTrajectory(**entry["trajectory"]) if "trajectory" in entry else None
         return Source(video_id=video_id, path=Path(entry["path"]), leave_out_s=leave_out_s, trajectory=trajectory)
     except Exception as error:
@@ -94,7 +91,7 @@ def find_videos(arguments: Sequence[Path], *, out: Path | None = None) -> list[S
 
 
 def with_leave_out(sources: Mapping[str, Source], table: Path) -> dict[str, Source]:
-    """Sources with what a table (see ``read_leave_out``) leaves out of those that it names; the others as they are.
+    """Sources with what a table (for ``read_leave_out``) leaves out of those that it names; the others as they are.
 
     Raises:
         ConfigError: the table cannot be used, or names a video that is none of them.
@@ -129,36 +126,6 @@ def _check_id(video_id: str, path: Path) -> None:
             f"{path}: {video_id!r} is no video id (at most {LONGEST_VIDEO_ID} letters, digits, - and _); rename the "
             "file, or give a text file of lines `id<TAB>path` in its place"
         ) from error
-
-
-def read_leave_out(path: Path) -> dict[str, tuple[float, float]]:
-    """Seconds to leave out at each video's start and end: a CSV table with the columns ``video_id, start_s, end_s``.
-
-    Raises:
-        ConfigError: it cannot be read, lacks a column, names a video twice, or holds something that is no length.
-    """
-    spans: dict[str, tuple[float, float]] = {}
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            for number, row in enumerate(csv.DictReader(stream), start=2):
-                span = _pair((row["start_s"] or 0, row["end_s"] or 0))
-                if not _are_lengths(span) or row["video_id"] in spans:
-                    raise ValueError(f"line {number} repeats a video or is no length of time")
-                spans[row["video_id"]] = span
-    except KeyError as error:
-        raise ConfigError(f"{path}: has no column {error}; give video_id,start_s,end_s") from error
-    except (OSError, ValueError, TypeError, csv.Error) as error:
-        raise ConfigError(f"{path}: cannot be read as video_id,start_s,end_s ({error}); mend the table") from error
-    return spans
-
-
-def _pair(values: Sequence[Any]) -> tuple[float, float]:
-    start, end = values
-    return float(start), float(end)
-
-
-def _are_lengths(values: Sequence[float]) -> bool:
-    return all(0 <= value < math.inf for value in values)
 
 
 def _expand(argument: Path, out: Path | None) -> list[tuple[str, Path]]:

@@ -12,6 +12,7 @@ from dataset.selection import read_selection
 from labeling.errors import ConfigError
 from pipelines.commands import JobOptions, prepare_job, run_select
 from pipelines.config import merged
+from pipelines.given_tables import read_leave_out
 from pipelines.job import Job, open_job
 from pipelines.sources import Source, find_videos
 from pipelines.stage import NotReadyError
@@ -133,6 +134,21 @@ def test_a_job_inside_the_videos_folder_takes_nothing_of_a_job_for_a_source(tmp_
     for _ in range(2):
         job = prepare_job([two_files], root, JobOptions())
         assert list(job.sources) == ["a", "b", "d"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("a,-1,0", r"line 2 \(video a\): \(-1.0, 0.0\) are no two lengths of time"),
+        ("a,1,nan", "no two lengths of time"),
+        ("a,1,soon", r"line 2 \(video a\): end_s is 'soon', but must be a number"),
+        ("a,1,1\na,2,2", "line 3 names video a again"),
+    ],
+)
+def test_a_table_of_what_to_leave_out_holds_lengths(tmp_path, rows, message):
+    (tmp_path / "t.csv").write_text(f"video_id,start_s,end_s\n{rows}\n")
+    with pytest.raises(ConfigError, match=message):
+        read_leave_out(tmp_path / "t.csv")
 
 
 def test_a_link_to_a_video_that_is_gone_is_told_of(tmp_path, two_files):

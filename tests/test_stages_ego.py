@@ -22,8 +22,8 @@ from labeling.ego_tracks import RunTracks, StoredTracks
 from labeling.encoding import EncoderSettings, VideoWriter
 from labeling.errors import ConfigError, DataError, TrajectoryError
 from labeling.video import probe
-from pipelines.commands import read_cameras, read_split
 from pipelines.config import CameraSettings, Config, parse_config, video_camera
+from pipelines.given_tables import read_cameras, read_split
 from pipelines.job import Job
 from pipelines.sources import Source
 from pipelines.stage import WorkItem
