@@ -267,10 +267,15 @@ def _hashed_splits(video_ids: Sequence[str], rule: SelectionRule) -> dict[str, s
         return {
             name: "val" if hashed_share(rule.seed, "split", name) < rule.val_share else "train" for name in video_ids
         }
-    missing = sorted(set(video_ids) - set(rule.split))
+    check_split(rule.split, video_ids)
+    return {name: rule.split[name] for name in video_ids}
+
+
+def check_split(split: Collection[str], video_ids: Collection[str]) -> None:
+    """Raise ``ConfigError`` unless a split that a person gives names every video."""
+    missing = sorted(set(video_ids) - set(split))
     if missing:
         raise ConfigError(f"the split names no split for video {missing[0]!r}; give train or val for every video")
-    return {name: rule.split[name] for name in video_ids}
 
 
 def _judged(row: ClipRow, threshold: float | None, cutoff: float | None, seed: int) -> ClipRow:

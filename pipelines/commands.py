@@ -9,7 +9,7 @@ from typing import Any
 from rich.markup import escape
 
 from dataset.receipts import Receipt, make_folder
-from dataset.selection import read_selection
+from dataset.selection import check_split, read_selection
 from labeling.captions import read_caption_table
 from labeling.ego_import import FileClock
 from labeling.errors import ConfigError
@@ -164,9 +164,8 @@ def _check_tables(config: Config, video_ids: Sequence[str]) -> None:
     unknown = sorted(set(config.cameras) - set(video_ids))
     if unknown:
         raise ConfigError(f"cameras: {unknown[0]!r} is none of the videos; use ids, as {', '.join(video_ids[:3])}")
-    missing = sorted(set(video_ids) - set(config.select.split or video_ids))
-    if missing:
-        raise ConfigError(f"the split names no split for video {missing[0]!r}; give train or val for every video")
+    if config.select.split is not None:
+        check_split(config.select.split, video_ids)
 
 
 def configured(config: Config, options: JobOptions) -> Config:

@@ -32,8 +32,8 @@ def read_cameras(path: Path) -> dict[str, dict[str, float]]:
 
 
 def read_leave_out(path: Path) -> dict[str, tuple[float, float]]:
-    """Seconds to leave out at each video's start and end, from a CSV table with the columns ``video_id``, ``start_s`` and
-    ``end_s``.
+    """Seconds to leave out at each video's start and end, from a CSV table with the columns ``video_id``, ``start_s``
+    and ``end_s``.
 
     Raises:
         ConfigError: it cannot be read, lacks a column, or holds something that is no length.
