@@ -442,6 +442,46 @@ def test_a_training_leaves_weights_and_is_not_repeated(tmp_path: Path, capsys: p
     assert "frames" not in capsys.readouterr().out
 
 
+def test_a_second_lesson_goes_on_where_the_first_ended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("training.street_recipes._WINDOWS", ((128, 128, 1),))
+    monkeypatch.setattr("training.street_recipes._SECOND_COUNT", 1)
+    command = ["--only", "street_detector", "--streets", "1", "--share", "0.0002", "--workers", "1", "--train-only"]
+    command += ["--checkpoints", str(tmp_path), "--out", str(tmp_path)]
+    train_street_models(command)
+    first, second = tmp_path / "street_detector.pt", tmp_path / "street_detector_second_look.pt"
+    assert {first, second} == set(tmp_path.iterdir())
+    assert capsys.readouterr().out.count("7 frames") == 2
+    before, after = (torch.load(path, weights_only=True)["average"] for path in (first, second))
+    untouched = torch.equal(before["second.score.weight"], torch.zeros_like(before["second.score.weight"]))
+    assert untouched and not torch.equal(after["second.score.weight"], before["second.score.weight"])
+    # What the first look norms by stays as it was learnt.
+    assert torch.equal(after["first.trunk.stem.1.running_mean"], before["first.trunk.stem.1.running_mean"])
+    assert not torch.equal(after["first.head.weight"], before["first.head.weight"])
+    second.unlink()
+    train_street_models(command)
+    assert capsys.readouterr().out.count("7 frames") == 1
+    again = torch.load(second, weights_only=True)["average"]
+    assert all(torch.equal(value, after[name]) for name, value in again.items())
+    train_street_models(command)
+    assert "7 frames" not in capsys.readouterr().out
+
+
+def test_parts_of_a_network_learn_at_rates_of_their_own() -> None:
+    network = torch.nn.ModuleDict({"slow": torch.nn.Linear(1, 1), "rest": torch.nn.Linear(1, 1)})
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+
+    def loss(network: torch.nn.Module, batch: torch.Tensor) -> torch.Tensor:
+        return (network["slow"](batch) + network["rest"](batch)).square().sum()  # type: ignore[index]
+
+    settings = FitSettings(
+        seed=0, steps=3, rates={"slow.": 0.0}, channels_last=False, average_decay=0.0, precision=torch.float32
+    )
+    after = fit(network, lambda rng: torch.ones(1, 1), loss, settings).state_dict()
+    assert {name for name, value in before.items() if torch.equal(value, after[name])} == {"slow.weight", "slow.bias"}
+
+
 @pytest.mark.skipif(torch.cuda.device_count() > 0, reason="there is a GPU")
 def test_a_training_on_a_gpu_that_is_not_there_ends_before_it_renders(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="no GPU"):
@@ -452,9 +492,10 @@ def test_a_training_on_a_gpu_that_is_not_there_ends_before_it_renders(tmp_path: 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_every_device_has_a_budget_for_every_model(device) -> None:
-    plans = [recipe(name, device=device) for name in MODEL_NAMES]
-    assert all(plan.fit.device == device and plan.fit.steps >= 1000 for plan in plans)
-    assert sum(plan.fit.loaders > 0 for plan in plans) == (len(plans) if device == "cuda" else 0)
+    fits = [lesson.fit for name in MODEL_NAMES for lesson in recipe(name, device=device).lessons]
+    assert all(settings.device == device and settings.steps >= 1000 for settings in fits)
+    assert sum(settings.loaders > 0 for settings in fits) == (len(fits) if device == "cuda" else 0)
+    assert len({settings.name for settings in fits}) == len(fits)
 
 
 @pytest.mark.parametrize("name", MODEL_NAMES)

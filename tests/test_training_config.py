@@ -144,6 +144,8 @@ def test_dry_run_of_a_tiny_network_says_no_zeros() -> None:
     assert "MiB: " in values["memory per GPU (estimate)"] and values["work per step"].endswith(" GFLOP")
     assert values["at the given rate"] == "7,200 steps per hour, 20.0 s in all"
     assert not {"0.0", "0.00"} & set(" ".join(values.values()).split())
+    slow = dict(plan_run(load_config("tiny", stage="motion"), steps_per_second=1e-4).rows())
+    assert slow["at the given rate"].startswith("0.36 steps per hour, ")
 
 
 def test_a_plan_of_own_weights_needs_their_size() -> None:

@@ -80,9 +80,9 @@ class RunPlan:
             ("work per step", _scaled(self.petaflops_per_step * 1e15, _WORK)),
         ]  # fmt: skip
         if self.hours is not None:
-            rows.append(
-                ("at the given rate", f"{self.steps / self.hours:,.0f} steps per hour, {_time(self.hours)} in all")
-            )
+            rate = self.steps / self.hours
+            shown = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+            rows.append(("at the given rate", f"{shown} steps per hour, {_time(self.hours)} in all"))
         return rows
 
 

@@ -13,8 +13,10 @@ from labeling.detection import LETTERBOX_GREY
 from labeling.model_cards import IMAGENET_MEAN, IMAGENET_STD
 from labeling.schemas import Category, KeypointSchema, keypoint_schema
 from training.street_augment import AugmentSettings, disturb, map_boxes, map_points, put_board, random_map
+from training.street_losses import MINOR
 from training.street_networks import FIELD_STRIDE
-from training.street_pool import ObjectTruth, PoolCrop, PoolFrame, StreetPool, frames_with
+from training.street_pool import PICTURE_SCALE, ObjectTruth, PoolCrop, PoolFrame, StreetPool, frames_with
+from training.street_scores import JUDGED_HEIGHT_PX, JUDGED_SHARE
 from training.street_targets import FieldVotes, GridTargets, encode_boxes, encode_fields, encode_responses
 
 CLASSES: tuple[Category, ...] = ("car", "person")
@@ -23,6 +25,8 @@ LEAST_SHARE = 0.15
 """Objects of which less is visible are left out of the detector's loss: neither asked for nor forbidden."""
 _LEAST_WINDOW_PX = 9.0
 """Lower objects are left out of the detector's loss too: of all objects a tenth, and of no use."""
+_NEARLY = 0.8
+"""Of what is asked of an object that is judged: below it, a learner is asked less of, too."""
 _HIDDEN_WEIGHT = 0.25
 _MEAN_COLOUR = tuple(float(round(value)) for value in IMAGENET_MEAN)
 _BOX_SLACK_PX = 2.0
@@ -102,12 +106,10 @@ class DetectorBatches:
             )  # fmt: skip
             grey = (LETTERBOX_GREY,) * 3
             window = cv2.warpAffine(frame.picture, picture_to_window, size, borderValue=grey)
-            found = [truth for truth in frame.objects if truth.category in CLASSES]
-            inside, labels, counted = _boxes_inside(found, frame.scale, picture_to_window, size)
-            targets.append(encode_boxes(inside, labels, counted, width=size[0], height=size[1]))
+            found = _boxes_inside(frame, picture_to_window, size)
+            targets.append(encode_boxes(found.xyxy, found.classes, found.counted, width=size[0], height=size[1]))
             pictures.append(disturb(window, rng, self.augment))
-        parts = zip(*((one.classes, one.boxes_xyxy, one.weights) for one in targets), strict=True)
-        return Batch(pictures=_stack(pictures), targets=tuple(_stack(part) for part in parts))
+        return Batch(pictures=_stack(pictures), targets=_stack_grids(targets))
 
     def _focus(self, frame: PoolFrame, rng: np.random.Generator, category: Category) -> np.ndarray | None:
         """The middle of one object, picture pixels; one window in four lies anywhere."""
@@ -120,21 +122,108 @@ class DetectorBatches:
         return (box[:2] + box[2:]) / 2 * frame.scale
 
 
-def _boxes_inside(
-    found: list[ObjectTruth], scale: float, picture_to_window: np.ndarray, size: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Boxes (n, 4), classes and whether they count, of what touches a window of width and height ``size``."""
-    if not found:
-        return np.zeros((0, 4), np.float32), np.zeros(0, np.int64), np.zeros(0, bool)
-    whole = map_boxes(np.stack([truth.box_xyxy for truth in found]) * scale, picture_to_window)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Boxes:
+    """What touches a window."""
+
+    xyxy: np.ndarray
+    """(n, 4) float32, window pixels, inside it."""
+    classes: np.ndarray
+    """(n,) int64."""
+    shares: np.ndarray
+    """(n,) visible shares, of what lies within the window."""
+
+    @property
+    def heights(self) -> np.ndarray:
+        """(n,) pixels."""
+        return self.xyxy[:, 3] - self.xyxy[:, 1]
+
+    @property
+    def counted(self) -> np.ndarray:
+        """(n,) bool: large and visible enough for the detector's loss."""
+        return (self.shares >= LEAST_SHARE) & (self.heights >= _LEAST_WINDOW_PX)
+
+
+def _boxes_inside(frame: PoolFrame, picture_to_window: np.ndarray, size: Sequence[int]) -> _Boxes:
+    """Cars and people in a window of width and height ``size`` of a frame."""
+    found = [truth for truth in frame.objects if truth.category in CLASSES]
+    boxes = np.array([truth.box_xyxy for truth in found], np.float32).reshape(-1, 4)
+    whole = map_boxes(boxes * frame.scale, picture_to_window)
     inside = np.clip(whole, 0, np.tile(size, 2))
     sides, whole_sides = inside[:, 2:] - inside[:, :2], whole[:, 2:] - whole[:, :2]
     left = np.prod(sides, axis=1) / np.maximum(np.prod(whole_sides, axis=1), 1e-6)
-    shares = left * np.array([truth.visible_share for truth in found])
-    labels = np.array([CLASSES.index(truth.category) for truth in found])
     touching = (sides > 1).all(axis=1)
-    counted = (shares >= LEAST_SHARE) & (sides[:, 1] >= _LEAST_WINDOW_PX) & touching
-    return inside[touching].astype(np.float32), labels[touching], counted[touching]
+    return _Boxes(
+        xyxy=inside[touching].astype(np.float32),
+        classes=np.array([CLASSES.index(truth.category) for truth in found], np.int64)[touching],
+        shares=(left * np.array([truth.visible_share for truth in found], np.float64))[touching],
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SecondLookBatches:
+    """Whole pictures as the detector will see them, some plain, most moved and disturbed; grid targets and objects."""
+
+    pool: StreetPool
+    count: int
+    augment: AugmentSettings
+    scales: tuple[float, float] = (0.85, 1.2)
+    plain_share: float = 0.3
+    person_share: float = 0.4
+    """Of pictures with a person in them for sure."""
+
+    def __call__(self, rng: np.random.Generator) -> Batch:
+        """One batch: targets are those of ``DetectorBatches``, then boxes (N, G, 4), classes (N, G), -1 where there are
+        fewer than G objects, and their importance (N, G), as ``second_look_loss`` takes them."""
+        pictures, grids, objects = [], [], []
+        with_people = frames_with(self.pool, "person")
+        for _ in range(self.count):
+            people = bool(len(with_people)) and rng.random() < self.person_share
+            frame = self.pool.frames[int(rng.choice(with_people) if people else rng.integers(len(self.pool.frames)))]
+            height, width = frame.picture.shape[:2]
+            plain, flip = rng.random() < self.plain_share, bool(rng.random() < 0.5)
+            to_window = random_map(
+                rng, source=(width, height), target=(width, height), scales=(1.0, 1.0) if plain else self.scales,
+                flip=flip,
+            )  # fmt: skip
+            window = cv2.warpAffine(frame.picture, to_window, (width, height), borderValue=(LETTERBOX_GREY,) * 3)
+            pictures.append(window if plain else disturb(window, rng, self.augment))
+            objects.append(_boxes_inside(frame, to_window, (width, height)))
+            grids.append(
+                encode_boxes(
+                    objects[-1].xyxy, objects[-1].classes, objects[-1].counted, width=width, height=height
+                )
+            )  # fmt: skip
+        most = max(1, *(len(found.classes) for found in objects))
+        parts = (
+            [_padded(found.xyxy, most, 0) for found in objects],
+            [_padded(found.classes, most, -1) for found in objects],
+            [_padded(_importance(found), most, 0) for found in objects],
+        )
+        return Batch(pictures=_stack(pictures), targets=(*_stack_grids(grids), *map(_stack, parts)))
+
+
+def _importance(found: _Boxes) -> np.ndarray:
+    """(n,) float32 1 where an object is judged, half of it where nearly, less where it counts at all, else nothing."""
+    asked = (
+        (MINOR, LEAST_SHARE, _LEAST_WINDOW_PX), (0.5, _NEARLY * JUDGED_SHARE, _NEARLY * JUDGED_HEIGHT_PX),
+        (1.0, JUDGED_SHARE, JUDGED_HEIGHT_PX),
+    )  # fmt: skip
+    values = np.zeros(len(found.classes), np.float32)
+    for importance, share, height in asked:
+        values[(found.shares >= share) & (found.heights >= height * PICTURE_SCALE)] = importance
+    return values
+
+
+def _padded(values: np.ndarray, length: int, fill: float) -> np.ndarray:
+    """Values (n, ...) made ``length`` long."""
+    return np.pad(values, [(0, length - len(values)), *[(0, 0)] * (values.ndim - 1)], constant_values=fill)
+
+
+def _stack_grids(targets: Sequence[GridTargets]) -> tuple[torch.Tensor, ...]:
+    """Classes (N, A), boxes (N, A, 4) and weights (N, A)."""
+    parts = zip(*((one.classes, one.boxes_xyxy, one.weights) for one in targets), strict=True)
+    return tuple(_stack(part) for part in parts)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -45,7 +45,7 @@ def export_model(graph: nn.Module, card: ModelCard, folder: Path, *, tolerance: 
             folded, (pictures[:1],), str(raw), dynamo=False, opset_version=OPSET, input_names=["input"],
             output_names=names, dynamic_axes={name: {0: "batch"} for name in ("input", *names)},
         )  # fmt: skip
-        model = halve_weights(onnx.load(str(raw)))
+        model = shorten_names(halve_weights(onnx.load(str(raw))))
     for output, shape in zip(model.graph.output, card.output_shapes().values(), strict=True):
         for dimension, size in zip(output.type.tensor_type.shape.dim[1:], shape[1:], strict=True):
             dimension.dim_value = int(size or 0)
@@ -83,6 +83,24 @@ def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
     nodes = [*casts, *model.graph.node]
     del model.graph.node[:]
     model.graph.node.extend(nodes)
+    return model
+
+
+def shorten_names(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The same graph with its inner tensors numbered: their paths through the modules are a good part of a small file.
+
+    Inputs, outputs and weights keep their names.
+    """
+    kept = {value.name for value in (*model.graph.input, *model.graph.output, *model.graph.initializer)}
+    short: dict[str, str] = {}
+    for node in model.graph.node:
+        node.name = ""
+        is_weight = node.op_type == "Cast" and node.input[0] in kept
+        for name in node.output:
+            short[name] = name if name in kept or is_weight else f"t{len(short)}"
+        node.output[:] = [short[name] for name in node.output]
+        node.input[:] = [short.get(name, name) for name in node.input]
+    del model.graph.value_info[:]
     return model
 
 

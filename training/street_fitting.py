@@ -5,7 +5,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,10 @@ class FitSettings:
     learning_rate: float = 2e-3
     """Peak of AdamW's rate; it warms up over the first twentieth and falls to nothing along a cosine."""
     weight_decay: float = 0.01
+    rates: dict[str, float] = field(default_factory=dict)
+    """Share of the rate for parts of the network, by the start of their names; 1 for all others."""
+    fixed_norms: bool = False
+    """Norm by what was learnt before, not by the batch: for a network that is trained already and goes on."""
     average_decay: float = 0.998
     """Of the moving average of weights that is returned."""
     precision: torch.dtype | None = None
@@ -74,17 +78,23 @@ def fit(
     if settings.channels_last:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network)
+    rated = _rated(network, settings.rates)
     optimiser = torch.optim.AdamW(
-        network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=(0.9, 0.99)
-    )
+        [{"params": parameters} for parameters in rated.values()], lr=settings.learning_rate,
+        weight_decay=settings.weight_decay, betas=(0.9, 0.99),
+    )  # fmt: skip
+    if settings.fixed_norms:
+        for module in network.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eval()
     state = _State(network=network, average=average, optimiser=optimiser, settings=settings)
     first = state.load(checkpoint, settings.device) if checkpoint and checkpoint.is_file() else 0
     device = torch.device(settings.device)
     precision = settings.precision or best_precision(device)
     recent: list[torch.Tensor] = []
     for step, batch in enumerate(_prefetched(make_batch, settings, first=first), first):
-        for group in optimiser.param_groups:
-            group["lr"] = settings.learning_rate * rate_at(step, settings.steps)
+        for share, group in zip(rated, optimiser.param_groups, strict=True):
+            group["lr"] = settings.learning_rate * share * rate_at(step, settings.steps)
         with torch.autocast(device.type, precision, enabled=precision != torch.float32):
             loss = loss_of(network, batch if device.type == "cpu" else batch.to(device))
         optimiser.zero_grad(set_to_none=True)
@@ -104,6 +114,15 @@ def fit(
     if checkpoint:
         _save({"finished": settings.steps, "average": average.state_dict()}, checkpoint)
     return average
+
+
+def _rated(network: nn.Module, rates: dict[str, float]) -> dict[float, list[nn.Parameter]]:
+    """Parameters by their share of the rate."""
+    groups: dict[float, list[nn.Parameter]] = {}
+    for name, parameter in network.named_parameters():
+        share = next((share for start, share in rates.items() if name.startswith(start)), 1.0)
+        groups.setdefault(share, []).append(parameter)
+    return groups
 
 
 def best_precision(device: torch.device) -> torch.dtype:

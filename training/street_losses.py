@@ -4,6 +4,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from training.street_second_look import SecondScores, pair_overlap
+
+_MATCH_IOU = 0.4
+"""Of a candidate with an object that it may be the one of: somewhat more than the judge asks for."""
+_INSIDE = 0.5
+"""Share of a candidate within an object that is not judged, from which on nothing is said of it."""
+MINOR = 0.3
+"""Weight of candidates that no judge asks about, found or not."""
+
 
 def detector_loss(
     rows: Tensor, classes: Tensor, boxes_xyxy: Tensor, weights: Tensor, cells: Tensor, strides: Tensor
@@ -107,3 +116,56 @@ def field_loss(field: Tensor, places: Tensor, values: Tensor) -> Tensor:
     places_off = functional.smooth_l1_loss(picked[:, :offsets], values[:, :offsets], beta=0.1, reduction="sum")
     scales_off = functional.l1_loss(picked[:, offsets:], values[:, offsets:], reduction="sum")
     return 3 * entropy / count + (places_off + 0.2 * scales_off) / (width // 3 * count)
+
+
+def second_look_loss(
+    look: SecondScores, boxes_xyxy: Tensor, classes: Tensor, importance: Tensor, *, size: tuple[int, int], low_px: float
+) -> Tensor:
+    """Cross-entropy of the second look's scores, per picture.
+
+    Of each object the candidate that scores highest is right, and every other is wrong (Hosang et al. 2017).
+
+    Args:
+        look: of N pictures.
+        boxes_xyxy: (N, G, 4) objects, input pixels, inside the picture.
+        classes: (N, G) int64; -1 where there is no object.
+        importance: (N, G) weight of each object: 1 where it is judged, less where it need not be found.
+        size: width and height of the pictures.
+        low_px: height from which on what is found is judged.
+    """
+    limits = boxes_xyxy.new_tensor((*size, *size))
+    boxes = torch.minimum(look.candidates.boxes_xyxy.clamp(min=0), limits)
+    shared, areas = pair_overlap(boxes, boxes_xyxy)
+    sides = boxes_xyxy[..., 2:] - boxes_xyxy[..., :2]
+    others = sides[..., 0] * sides[..., 1]
+    overlap = shared / (areas[..., None] + others[:, None] - shared).clamp(min=1e-6)
+    minor = torch.where(boxes[..., 3] - boxes[..., 1] < low_px, MINOR, 1.0)
+    total = look.logits.new_zeros(())
+    for index in range(look.logits.shape[2]):
+        logits, mine = look.logits[..., index], classes == index
+        match = match_candidates(logits.detach(), torch.where(mine[:, None], overlap, 0.0))
+        on_unjudged = ((shared / areas[..., None] > _INSIDE) & (mine & (importance < 1))[:, None]).any(dim=2)
+        weights = torch.where(on_unjudged, 0.0, minor)
+        weights = torch.where(match >= 0, importance.gather(1, match.clamp(min=0)), weights)
+        wanted = (match >= 0).to(logits)
+        entropy = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
+        total = total + (entropy * weights).sum()
+    return total / len(boxes)
+
+
+def match_candidates(scores: Tensor, overlap: Tensor) -> Tensor:
+    """(N, M) object of each candidate or -1: the best candidate chooses first, each object is chosen once.
+
+    Args:
+        scores: (N, M).
+        overlap: (N, M, G) of candidates with objects; only ``_MATCH_IOU`` and more matches.
+    """
+    match = torch.full(scores.shape, -1, device=scores.device)
+    free = torch.ones_like(overlap[:, 0])
+    for chooser in scores.argsort(dim=1, descending=True).T:
+        row = chooser[:, None, None].expand(-1, 1, overlap.shape[2])
+        best, at = (overlap.gather(1, row).squeeze(1) * free).max(dim=1)
+        hit = (best >= _MATCH_IOU)[:, None]
+        match.scatter_(1, chooser[:, None], torch.where(hit, at[:, None], -1))
+        free.scatter_(1, at[:, None], torch.where(hit, 0.0, free.gather(1, at[:, None])))
+    return match

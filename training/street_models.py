@@ -30,9 +30,16 @@ from labeling.model_cards import SHIPPED_CARDS, SimccCard, YoloxCard, read_card
 from labeling.model_cards import write_card as write_model_card
 from training.street_export import export_model
 from training.street_fitting import fit, is_finished, load_finished
-from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, judging_frames, plan_lessons
+from training.street_plans import (
+    HELD_OUT_SEED,
+    SECOND_LOOK_SEED,
+    TRAIN_SEED,
+    VALIDATION_SEED,
+    judging_frames,
+    plan_lessons,
+)
 from training.street_pool import StreetPool, render_pool
-from training.street_recipes import BUDGETS, MODEL_NAMES, Device, ModelName, Recipe, recipe
+from training.street_recipes import BUDGETS, MODEL_NAMES, Device, Lesson, ModelName, PoolName, Recipe, recipe
 from training.street_scores import StreetModels, Tally, grouped_standard_error, judge_frame
 from training.street_thresholds import choose_thresholds
 
@@ -57,21 +64,25 @@ class _Job:
     def plan(self) -> Recipe:
         return recipe(self.name, device=self.device, seed=self.seed, share=self.share)
 
-    @property
-    def checkpoint(self) -> Path:
-        return self.checkpoints / f"{self.name}.pt"
+    def checkpoint(self, lesson: Lesson) -> Path:
+        return self.checkpoints / f"{lesson.fit.name}.pt"
+
+    def has_learnt(self, lesson: Lesson) -> bool:
+        return is_finished(self.checkpoint(lesson), lesson.fit.steps)
 
     @property
-    def is_finished(self) -> bool:
-        return is_finished(self.checkpoint, self.plan.fit.steps)
+    def unfinished(self) -> tuple[Lesson, ...]:
+        lessons = self.plan.lessons
+        return () if self.has_learnt(lessons[-1]) else tuple(one for one in lessons if not self.has_learnt(one))
 
 
-_shared_pool: list[StreetPool] = []
+_shared_pools: dict[PoolName, StreetPool] = {}
 
 
-def _train_models(jobs: Sequence[_Job], pool: StreetPool, *, at_once: int) -> None:
+def _train_models(jobs: Sequence[_Job], pools: dict[PoolName, StreetPool], *, at_once: int) -> None:
     """Train models side by side, one thread each, in the order given; no model's weights depend on company."""
-    _shared_pool[:] = [pool]
+    _shared_pools.clear()
+    _shared_pools.update(pools)
     # Forked workers see the pool where it is: it would take longer to send than to render.
     with ProcessPoolExecutor(min(at_once, len(jobs)), mp_context=get_context("fork")) as processes:
         for name, seconds in processes.map(_train, jobs):
@@ -84,8 +95,14 @@ def _train(job: _Job) -> tuple[str, float]:
     _keep_memory()
     start = time.perf_counter()
     plan = job.plan
-    torch.manual_seed(plan.fit.seed)
-    fit(plan.network(), plan.batches(_shared_pool[0]), plan.loss, plan.fit, checkpoint=job.checkpoint)
+    torch.manual_seed(job.seed)
+    network = plan.network()
+    for lesson in plan.lessons:
+        if job.has_learnt(lesson):
+            network = load_finished(network, job.checkpoint(lesson))
+        else:
+            batches = lesson.batches(_shared_pools[lesson.pool])
+            network = fit(network, batches, lesson.loss, lesson.fit, checkpoint=job.checkpoint(lesson))
     return job.name, time.perf_counter() - start
 
 
@@ -149,24 +166,35 @@ def train_all(options: argparse.Namespace) -> None:
         _Job(name=name, device=options.device, seed=options.seed, share=options.share, checkpoints=options.checkpoints)
         for name in options.only
     ]
-    missing = [job for job in jobs if not job.is_finished]
+    missing = [job for job in jobs if job.unfinished]
     if missing:
         # Counted without opening the GPU, which forked processes could not use then.
         if options.device == "cuda" and not torch.cuda.device_count():
             raise SystemExit("--device cuda: torch sees no GPU; leave it out, or name finished --checkpoints")
-        start = time.perf_counter()
-        plans = plan_lessons(TRAIN_SEED, options.streets or budget.streets, frames=7, every=15)
-        pool = render_pool(plans, workers=options.workers)
-        counts = {name: len(found) for name, found in pool.crops.items()}
-        print(f"{len(pool.frames)} frames, crops {counts}, {time.perf_counter() - start:.0f} s", flush=True)
-        _train_models(missing, pool, at_once=budget.jobs)
+        needed = {lesson.pool for job in missing for lesson in job.unfinished}
+        pools: dict[PoolName, StreetPool] = {}
+        if "first" in needed:
+            pools["first"] = _rendered(TRAIN_SEED, options.streets or budget.streets, options.workers)
+        if "others" in needed:
+            pools["others"] = _rendered(SECOND_LOOK_SEED, options.streets or budget.other_streets, options.workers)
+        _train_models(missing, pools, at_once=budget.jobs)
     if options.train_only:
         return
     for job in jobs:
         plan = job.plan
-        export_model(plan.graph(load_finished(plan.network(), job.checkpoint)), plan.card, options.out)
+        export_model(
+            plan.graph(load_finished(plan.network(), job.checkpoint(plan.lessons[-1]))), plan.card, options.out
+        )
     frames = list(judging_frames(VALIDATION_SEED, options.judged_streets, JUDGED_FRAMES))
     choose_thresholds(options.out, options.only, frames)
+
+
+def _rendered(first_seed: int, streets: int, workers: int) -> StreetPool:
+    start = time.perf_counter()
+    pool = render_pool(plan_lessons(first_seed, streets, frames=7, every=15), workers=workers)
+    counts = {name: len(found) for name, found in pool.crops.items()}
+    print(f"{len(pool.frames)} frames, crops {counts}, {time.perf_counter() - start:.0f} s", flush=True)
+    return pool
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -15,7 +15,8 @@ from labeling.schemas import keypoint_schema
 
 DETECTOR_STRIDES = (8, 16, 32)
 FIELD_STRIDE = 8
-_MAX_LOG_SIZE = 5.0
+MAX_LOG_SIZE = 5.0
+"""Sides of no object are more cells than its exponential."""
 
 
 def conv_unit(inputs: int, outputs: int, *, stride: int = 1, kernel: int = 3) -> nn.Sequential:
@@ -55,7 +56,11 @@ class Trunk(nn.Module):
 
     def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
         """Features of every stage, finest first."""
-        x, features = self.stem(x), []
+        return self.refine(self.stem(x))
+
+    def refine(self, x: torch.Tensor) -> list[torch.Tensor]:
+        """As ``forward``, from what the stem made of a picture."""
+        features = []
         for stage in self.stages:
             x = stage(x)
             features.append(x)
@@ -99,6 +104,7 @@ class StreetDetector(nn.Module):
         towers: Sequence[bool] = (False, True, True),
     ) -> None:
         super().__init__()
+        self.fine_channels = widths[0]
         self.trunk = Trunk(widths, depths)
         self.pyramid = Pyramid(widths[1:], width)
         self.tower = nn.ModuleList(conv_unit(width, width) if built else nn.Identity() for built in towers)
@@ -108,9 +114,36 @@ class StreetDetector(nn.Module):
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
         """(N, 3, H, W) BGR 0 to 255 to (N, A, 5 + C): offset x, y, log size w, h, then logits."""
-        features = self.pyramid(self.trunk(pictures / 64.0 - 2.0))[: len(DETECTOR_STRIDES)]
-        rows = [self.head(tower(x)).flatten(2) for tower, x in zip(self.tower, features, strict=True)]
-        return torch.cat(rows, dim=2).transpose(1, 2)
+        return self.look(pictures).rows
+
+    def look(self, pictures: torch.Tensor) -> "FirstLook":
+        """As ``forward``, with the features that led there."""
+        fine = self.trunk.stem(pictures / 64.0 - 2.0)
+        levels = self.pyramid(self.trunk.refine(fine))[: len(DETECTOR_STRIDES)]
+        towers = [tower(x) for tower, x in zip(self.tower, levels, strict=True)]
+        return FirstLook(
+            rows=_by_cell([self.head(x) for x in towers]).transpose(1, 2), cell_features=_by_cell(towers), fine=fine,
+            coarse=levels[0],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FirstLook:
+    """What a detector makes of pictures."""
+
+    rows: torch.Tensor
+    """(N, A, 5 + C) as ``StreetDetector`` gives them."""
+    cell_features: torch.Tensor
+    """(N, width, A) from which each row is read."""
+    fine: torch.Tensor
+    """(N, widths[0], H / 4, W / 4)."""
+    coarse: torch.Tensor
+    """(N, width, H / 8, W / 8): the pyramid's finest level."""
+
+
+def _by_cell(levels: list[torch.Tensor]) -> torch.Tensor:
+    """(N, D, A) cells of all strides from their maps (N, D, h, w)."""
+    return torch.cat([level.flatten(2) for level in levels], dim=2)
 
 
 class DetectorGraph(nn.Module):
@@ -123,7 +156,7 @@ class DetectorGraph(nn.Module):
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
         """``output`` (N, A, 5 + C)."""
         rows = self.network(pictures)
-        return torch.cat([rows[..., :2], rows[..., 2:4].clamp(max=_MAX_LOG_SIZE), rows[..., 4:].sigmoid()], dim=2)
+        return torch.cat([rows[..., :2], rows[..., 2:4].clamp(max=MAX_LOG_SIZE), rows[..., 4:].sigmoid()], dim=2)
 
 
 class SimccNetwork(nn.Module):
@@ -240,6 +273,6 @@ class FieldGraph(nn.Module):
             for field, ends in ((cif, 1), (caf, 2)):
                 confidence = (one.gain * field[:, :, :1] + one.shift).sigmoid()
                 places = [field[:, :, 1 + 2 * end : 3 + 2 * end] + self.offsets for end in range(ends)]
-                scale = one.widen * field[:, :, 1 + 2 * ends :].clamp(max=_MAX_LOG_SIZE).exp()
+                scale = one.widen * field[:, :, 1 + 2 * ends :].clamp(max=MAX_LOG_SIZE).exp()
                 outputs.append(torch.cat([confidence * 0, confidence, *places, scale], dim=2))
         return outputs

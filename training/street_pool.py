@@ -14,6 +14,8 @@ from labeling.schemas import Category
 
 PICTURE_SIZE = (768, 512)
 """Width and height at which frames are kept: the detector's input; 8/11 of 1056x704."""
+PICTURE_SCALE = 8 / 11
+"""Picture pixels per frame pixel."""
 CROP_MARGIN = 1.8
 """Side of a stored crop relative to the object's box, so that it can still be moved, turned and scaled."""
 CROP_LIMIT_PX = 360

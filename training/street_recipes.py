@@ -1,28 +1,36 @@
 """How each shipped street model comes to be: card, network, batches, loss and length of its training."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import torch
 from torch import nn
 
-from labeling.model_cards import CifcafCard, FieldHeadCard, ModelCard, SimccCard, SoftSuppression, YoloxCard
+from labeling.model_cards import CifcafCard, FieldHeadCard, ModelCard, SimccCard, YoloxCard
 from training.street_augment import AugmentSettings
-from training.street_batches import CLASSES, Batch, CropBatches, DetectorBatches, FieldBatches, to_input
+from training.street_batches import (
+    CLASSES,
+    Batch,
+    CropBatches,
+    DetectorBatches,
+    FieldBatches,
+    SecondLookBatches,
+    to_input,
+)
 from training.street_fitting import FitSettings
-from training.street_losses import detector_loss, field_loss, simcc_loss
+from training.street_losses import detector_loss, field_loss, second_look_loss, simcc_loss
 from training.street_networks import (
     FIELD_STRIDE,
-    DetectorGraph,
     FieldGraph,
     FieldNetwork,
     Sharpening,
     SimccGraph,
     SimccNetwork,
-    StreetDetector,
 )
-from training.street_pool import PICTURE_SIZE, StreetPool
+from training.street_pool import PICTURE_SCALE, PICTURE_SIZE, StreetPool
+from training.street_scores import JUDGED_HEIGHT_PX
+from training.street_second_look import OBJECTS, TwoLookDetector, TwoLookGraph
 from training.street_targets import grid_cells
 
 ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_fields"]
@@ -31,10 +39,8 @@ MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
 _WINDOWS = ((416, 288, 6), (*PICTURE_SIZE, 2))
 """Of the detector: windows are full of objects, whole pictures show both ends of near cars. Small batches, many steps:
 of the same pictures twice as many find more people."""
-_SOFT_NMS = SoftSuppression(sigma=0.4, part_cost=0.4)
-"""Chosen, as the thresholds. Cars that stand close overlap by up to 0.55: a hard limit of 0.45 lost one in 4 % of the
-validation streets' frames, one of 0.6 left as many doubles. Halves of near cars look like cars: the cost of parts takes
-phantoms from 0.017 to 0.007 a frame at a score of 0.3."""
+_SECOND_COUNT, _SECOND_RATE = 6, 1e-4
+"""Whole pictures of a batch for the second look, and the peak rate at which the first look goes on learning."""
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
 _HEAD_WIDTHS = {"car24": (32, 56, 88), "coco17": (32, 56, 88, 72)}
 _HIDDEN_WEIGHTS = {"car24": 1.0, "coco17": 2.0}
@@ -61,7 +67,11 @@ class Budget:
 
     streets: int
     """To learn from."""
+    other_streets: int
+    """For the detector's second look: those that its first look never saw, on which it is no better than elsewhere."""
     steps: dict[ModelName, int]
+    second_steps: int
+    """Of the second look."""
     enlarge: int
     """Batches are so many times as large as those of a core."""
     loaders: dict[ModelName, int]
@@ -71,18 +81,30 @@ class Budget:
 
 
 Device = Literal["cpu", "cuda"]
+PoolName = Literal["first", "others"]
+"""Streets that the pictures of a lesson are of."""
 BUDGETS: dict[Device, Budget] = {
     "cpu": Budget(
-        streets=384, enlarge=1, loaders=dict.fromkeys(MODEL_NAMES, 0), jobs=2,
-        steps={"street_detector": 15000, "street_fields": 6000, "street_coco17": 12000, "street_car24": 3000},
+        streets=384, other_streets=200, second_steps=2500, enlarge=1, loaders=dict.fromkeys(MODEL_NAMES, 0), jobs=2,
+        steps={"street_detector": 11000, "street_fields": 6000, "street_coco17": 12000, "street_car24": 3000},
     ),
     "cuda": Budget(
-        streets=960, enlarge=4, jobs=4,
+        streets=960, other_streets=800, second_steps=2400, enlarge=4, jobs=4,
         loaders={"street_detector": 6, "street_fields": 4, "street_coco17": 2, "street_car24": 1},
         steps={"street_detector": 14000, "street_fields": 6000, "street_coco17": 9000, "street_car24": 4000},
     ),
 }  # fmt: skip
 """Two cores in under an hour; one GPU with sixteen cores in under ten minutes, from which the shipped models come."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lesson:
+    """One training of a network; a later one goes on from the weights that an earlier one left."""
+
+    batches: Callable[[StreetPool], Callable[[Any], Batch]]
+    loss: Callable[[nn.Module, Batch], torch.Tensor]
+    fit: FitSettings
+    pool: PoolName = "first"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,9 +114,7 @@ class Recipe:
     card: ModelCard
     network: Callable[[], nn.Module]
     graph: Callable[[Any], nn.Module]
-    batches: Callable[[StreetPool], Callable[[Any], Batch]]
-    loss: Callable[[nn.Module, Batch], torch.Tensor]
-    fit: FitSettings
+    lessons: tuple[Lesson, ...]
 
 
 def recipe(name: ModelName, *, device: Device = "cpu", seed: int = 1, share: float = 1.0) -> Recipe:
@@ -112,33 +132,51 @@ def recipe(name: ModelName, *, device: Device = "cpu", seed: int = 1, share: flo
         loaders=budget.loaders[name],
     )  # fmt: skip
     if name == "street_detector":
-        return _detector_recipe(settings, budget.enlarge)
+        again = replace(
+            settings, name=f"{name}_second_look", steps=max(1, round(budget.second_steps * share)),
+            learning_rate=_SECOND_RATE, rates={"second.": 8.0}, fixed_norms=True,
+        )  # fmt: skip
+        return _detector_recipe(settings, again, budget.enlarge)
     if name == "street_fields":
         return _field_recipe(settings, budget.enlarge)
     return _head_recipe(name.removeprefix("street_"), settings, budget.enlarge)
 
 
-def _detector_recipe(settings: FitSettings, enlarge: int) -> Recipe:
-    grids = {(width, height): [torch.from_numpy(array) for array in grid_cells(width, height)]
-             for width, height, _ in _WINDOWS}  # fmt: skip
+def _detector_recipe(settings: FitSettings, again: FitSettings, enlarge: int) -> Recipe:
     sizes = tuple((width, height, count * enlarge) for width, height, count in _WINDOWS)
 
-    def loss(network: nn.Module, batch: Batch) -> torch.Tensor:
-        classes, boxes, weights = batch.targets
+    def cell_loss(rows: torch.Tensor, batch: Batch) -> torch.Tensor:
         height, width = batch.pictures.shape[1:3]
-        cells, strides = (array.to(classes.device, non_blocking=True) for array in grids[width, height])
-        rows = network(to_input(batch.pictures, "bgr255")).float()
-        return detector_loss(rows, classes, boxes, weights, cells, strides)
+        cells, strides = (torch.from_numpy(array).to(rows.device) for array in grid_cells(width, height))
+        classes, boxes, weights = batch.targets[:3]
+        return detector_loss(rows.float(), classes, boxes, weights, cells, strides)
+
+    def first_loss(network: nn.Module, batch: Batch) -> torch.Tensor:
+        assert isinstance(network, TwoLookDetector)
+        return cell_loss(network.first(to_input(batch.pictures, "bgr255")), batch)
+
+    def both_losses(network: nn.Module, batch: Batch) -> torch.Tensor:
+        first, second = network(to_input(batch.pictures, "bgr255"))
+        judged = second_look_loss(
+            second, *batch.targets[3:], size=PICTURE_SIZE, low_px=JUDGED_HEIGHT_PX * PICTURE_SCALE
+        )
+        return cell_loss(first.rows, batch) + 0.5 * judged
 
     card = YoloxCard(
         name=settings.name, file=f"{settings.name}.onnx", licence=_LICENCE, source=_SOURCE, classes=CLASSES,
         categories={name: name for name in CLASSES}, input_width=PICTURE_SIZE[0], input_height=PICTURE_SIZE[1],
-        score_threshold=0.4, soft_nms=_SOFT_NMS,
+        # The second look leaves one box of each object.
+        score_threshold=0.4, nms_threshold=1.0, max_detections=OBJECTS,
     )  # fmt: skip
-    return Recipe(
-        card=card, network=lambda: StreetDetector(len(CLASSES)), graph=DetectorGraph, loss=loss, fit=settings,
-        batches=lambda pool: DetectorBatches(pool=pool, sizes=sizes, augment=AugmentSettings()),
+    first = Lesson(
+        batches=lambda pool: DetectorBatches(pool=pool, sizes=sizes, augment=AugmentSettings()), fit=settings,
+        loss=first_loss,
     )  # fmt: skip
+    second = Lesson(
+        batches=lambda pool: SecondLookBatches(pool=pool, count=_SECOND_COUNT * enlarge, augment=AugmentSettings()),
+        fit=again, loss=both_losses, pool="others",
+    )  # fmt: skip
+    return Recipe(card=card, network=lambda: TwoLookDetector(len(CLASSES)), graph=TwoLookGraph, lessons=(first, second))
 
 
 def _head_recipe(schema: str, settings: FitSettings, enlarge: int) -> Recipe:
@@ -159,10 +197,10 @@ def _head_recipe(schema: str, settings: FitSettings, enlarge: int) -> Recipe:
     augment = AugmentSettings(blur_px=5, weather=0.1)
     return Recipe(
         card=card, network=lambda: SimccNetwork(schema, size, widths=_HEAD_WIDTHS[schema]),
-        graph=lambda network: SimccGraph(network, shift=_SEEN_SHIFT), loss=loss, fit=settings,
-        batches=lambda pool: CropBatches(
+        graph=lambda network: SimccGraph(network, shift=_SEEN_SHIFT),
+        lessons=(Lesson(loss=loss, fit=settings, batches=lambda pool: CropBatches(
             crops=pool.crops[card.category], schema=schema, size=size, count=32 * enlarge, augment=augment
-        ),
+        )),),
     )  # fmt: skip
 
 
@@ -184,9 +222,9 @@ def _field_recipe(settings: FitSettings, enlarge: int) -> Recipe:
         return torch.stack([field_loss(*truth) for truth in truths]).sum()
 
     return Recipe(
-        card=card, network=lambda: FieldNetwork(_FIELD_SCHEMAS), loss=loss, fit=settings,
+        card=card, network=lambda: FieldNetwork(_FIELD_SCHEMAS),
         graph=lambda network: FieldGraph(network, columns=columns, rows=rows, sharpen=_SHARPEN),
-        batches=lambda pool: FieldBatches(
+        lessons=(Lesson(loss=loss, fit=settings, batches=lambda pool: FieldBatches(
             pool=pool, schemas=_FIELD_SCHEMAS, size=_FIELD_SIZE, count=4 * enlarge, augment=AugmentSettings()
-        ),
+        )),),
     )  # fmt: skip

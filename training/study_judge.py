@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from labeling.camera import invert, rigid
 from labeling.detection import decode_yolox
-from labeling.model_cards import YoloxCard, load_cards
+from labeling.model_cards import SoftSuppression, YoloxCard, load_cards
 from training.street_fitting import FitSettings, fit
 from training.street_losses import detector_loss
 from training.street_networks import DetectorGraph, StreetDetector, conv_unit
@@ -114,7 +114,7 @@ class Judge:
         self.card = card.model_copy(
             update={
                 "input_width": 2 * width, "input_height": 2 * height, "classes": ("car",), "categories": {"car": "car"},
-                "score_thresholds": {}, "score_threshold": 0.3,
+                "score_thresholds": {}, "score_threshold": 0.3, "soft_nms": SoftSuppression(sigma=0.4, part_cost=0.4),
             }
         )  # fmt: skip
 
