@@ -45,9 +45,10 @@ from training.street_thresholds import choose_thresholds
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 """Of mallopt(3)."""
-JUDGED_STREETS, JUDGED_FRAMES = 90, 6
-"""As many streets choose the thresholds as judge, with so many frames each. Frames of one street show the same objects:
-on 30 streets the share of exact counts would have a standard error of three points and more, on 90 it is under two."""
+JUDGED_STREETS, CHOOSING_STREETS, JUDGED_FRAMES = 90, 270, 6
+"""So many streets judge, so many choose the thresholds, with so many frames each. Frames of one street show the same
+objects: on 30 streets the share of exact counts would have a standard error of three points and more, on 90 it is under
+two, on 270 about one, which is what thresholds differ by."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -185,7 +186,8 @@ def train_all(options: argparse.Namespace) -> None:
         export_model(
             plan.graph(load_finished(plan.network(), job.checkpoint(plan.lessons[-1]))), plan.card, options.out
         )
-    frames = list(judging_frames(VALIDATION_SEED, options.judged_streets, JUDGED_FRAMES))
+    streets = CHOOSING_STREETS * options.judged_streets // JUDGED_STREETS
+    frames = list(judging_frames(VALIDATION_SEED, streets, JUDGED_FRAMES))
     choose_thresholds(options.out, options.only, frames)
 
 

@@ -30,6 +30,8 @@ _SIGMA, _PART_COST = 0.4, 0.4
 first look alone, on the validation streets."""
 _LEAST = -9.0
 """Log score of what is as good as nothing."""
+_NOTHING = 0.01
+"""What scores less is given as nothing: which cells are the last candidates of an empty street is chance."""
 _PAIR_WIDTH, _NEAR = 32, 2.0
 """Channels of what one candidate tells another, and from how many of its sides away it does."""
 
@@ -313,7 +315,8 @@ class TwoLookGraph(nn.Module):
         first, second = self.network(pictures)
         scores = second.logits.sigmoid()
         best = scores.amax(dim=2, keepdim=True)
-        judged = torch.cat([best, scores / best.clamp(min=1e-6)], dim=2)
+        best = best * (best > _NOTHING).float()
+        judged = torch.cat([best, scores / best.clamp(min=_NOTHING)], dim=2) * (best > 0).float()
         index = second.candidates.index[..., None].expand_as(judged)
         rows = torch.zeros_like(first.rows[..., 4:]).scatter(1, index, judged)
         return torch.cat([first.rows[..., :2], first.rows[..., 2:4].clamp(max=MAX_LOG_SIZE), rows], dim=2)

@@ -14,7 +14,7 @@ from training.street_scores import Tally, is_judged, judge_car_fields, judge_lan
 
 BOX_SCORES = tuple(float(value) for value in np.round(np.arange(0.1, 0.76, 0.05), 2))
 """Of boxes, to choose from."""
-SURE_SCORES = tuple(float(value) for value in np.round(np.arange(0.1, 0.8, 0.01), 2))
+SURE_SCORES = tuple(float(value) for value in np.round(np.arange(0.1, 0.96, 0.01), 2))
 """Of boxes, from which a track may begin, to choose from."""
 OBJECT_SCORES = tuple(float(value) for value in np.round(np.arange(0.16, 0.45, 0.03), 2))
 """Of bottom-up objects, to choose from."""
