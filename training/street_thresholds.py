@@ -19,8 +19,8 @@ SURE_SCORES = tuple(float(value) for value in np.round(np.arange(0.1, 0.96, 0.01
 OBJECT_SCORES = tuple(float(value) for value in np.round(np.arange(0.16, 0.45, 0.03), 2))
 """Of bottom-up objects, to choose from."""
 _LUCK = 0.005
-_FEW_PHANTOMS = 0.005
-"""Per frame and class, together one frame in a hundred: what a track may begin with. One phantom that is believed is
+_FEW_PHANTOMS = 0.0025
+"""Per frame and class, together one frame in two hundred: what a track may begin with. One phantom that is believed is
 shown for as long as it lasts."""
 JudgedFrame = tuple[np.ndarray, tuple[ObjectTruth, ...]]
 """(H, W, 3) uint8 RGB, and what is true in it."""
