@@ -1,5 +1,6 @@
 """The detector's second look: where it looks, what it is told, what it learns, and the graph that it becomes."""
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -224,6 +225,17 @@ def test_the_graph_keeps_to_the_size_of_its_picture(exported, tmp_path: Path, mo
     rows = run_graph(tmp_path / larger.file, pictures)
     with torch.no_grad():
         np.testing.assert_allclose(rows, TwoLookGraph(network)(pictures), atol=0.05)
+
+
+def test_a_picture_of_nothing_at_all_gives_nothing_and_no_nan(exported, tmp_path: Path) -> None:
+    """Logits of -200, whose sigmoid is 0 in float32."""
+    network = copy.deepcopy(exported[0])
+    with torch.no_grad():
+        network.first.head.weight[4:] = 0
+        network.first.head.bias[4:] = -200.0
+    card = export_model(TwoLookGraph(network), CARD, tmp_path)
+    rows = run_graph(tmp_path / card.file, torch.full((1, 3, HEIGHT, WIDTH), 114.0))
+    assert np.isfinite(rows).all() and not rows[..., 4:].any()
 
 
 def test_inner_names_are_short_and_weights_keep_theirs(exported) -> None:

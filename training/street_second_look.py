@@ -100,7 +100,8 @@ def _grid(coarse: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 def _log_scores(rows: torch.Tensor) -> torch.Tensor:
     """(..., C) logarithm of objectness times class score."""
-    return functional.logsigmoid(rows[..., 4:5]) + functional.logsigmoid(rows[..., 5:])
+    # Not logsigmoid: a graph takes the logarithm of a sigmoid for it, which is 0 where there is nothing at all.
+    return -functional.softplus(-rows[..., 4:5]) - functional.softplus(-rows[..., 5:])
 
 
 def _pick(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
