@@ -93,12 +93,9 @@ class DetectorBatches:
         """One batch: targets are classes (N, A), boxes (N, A, 4) and weights (N, A)."""
         pictures: list[np.ndarray] = []
         targets: list[GridTargets] = []
-        with_people = frames_with(self.pool, "person")
         *size, count = self.sizes[int(rng.integers(len(self.sizes)))]
         for _ in range(count):
-            people = bool(len(with_people)) and rng.random() < self.person_share
-            index = int(rng.choice(with_people)) if people else int(rng.integers(len(self.pool.frames)))
-            frame = self.pool.frames[index]
+            frame, people = _draw_frame(self.pool, rng, self.person_share)
             height, width = frame.picture.shape[:2]
             picture_to_window = random_map(
                 rng, source=(width, height), target=(size[0], size[1]), scales=self.scales, flip=rng.random() < 0.5,
@@ -120,6 +117,13 @@ class DetectorBatches:
         weights = np.array([box[3] - box[1] for box in boxes]) ** (1.0 if category == "person" else 0.5)
         box = boxes[int(rng.choice(len(boxes), p=weights / weights.sum()))]
         return (box[:2] + box[2:]) / 2 * frame.scale
+
+
+def _draw_frame(pool: StreetPool, rng: np.random.Generator, person_share: float) -> tuple[PoolFrame, bool]:
+    """A frame, and whether it was drawn among those with a person in them."""
+    with_people = frames_with(pool, "person")
+    people = bool(len(with_people)) and rng.random() < person_share
+    return pool.frames[int(rng.choice(with_people) if people else rng.integers(len(pool.frames)))], people
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -176,10 +180,8 @@ class SecondLookBatches:
         """One batch: targets are those of ``DetectorBatches``, then boxes (N, G, 4), classes (N, G), -1 where there are
         fewer than G objects, and their importance (N, G), as ``second_look_loss`` takes them."""
         pictures, grids, objects = [], [], []
-        with_people = frames_with(self.pool, "person")
         for _ in range(self.count):
-            people = bool(len(with_people)) and rng.random() < self.person_share
-            frame = self.pool.frames[int(rng.choice(with_people) if people else rng.integers(len(self.pool.frames)))]
+            frame, _ = _draw_frame(self.pool, rng, self.person_share)
             height, width = frame.picture.shape[:2]
             plain, flip = rng.random() < self.plain_share, bool(rng.random() < 0.5)
             to_window = random_map(

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from training.street_second_look import SecondScores, pair_overlap
+from training.street_second_look import SecondScores, decode_boxes, pair_overlap
 
 _MATCH_IOU = 0.4
 """Of a candidate with an object that it may be the one of: somewhat more than the judge asks for."""
@@ -31,9 +31,7 @@ def detector_loss(
     count = positive.sum().clamp(min=1)
     sample, cell = positive.nonzero(as_tuple=True)
     picked, truth = rows[sample, cell], boxes_xyxy[sample, cell]
-    centres = (picked[:, :2] + cells[cell]) * strides[cell, None]
-    halves = picked[:, 2:4].clamp(max=5).exp() * strides[cell, None] / 2
-    overlap, generalised = _overlaps(torch.cat([centres - halves, centres + halves], dim=1), truth)
+    overlap, generalised = _overlaps(decode_boxes(picked, cells[cell], strides[cell]), truth)
     objectness = torch.zeros_like(rows[..., 4])
     # The overlap ranks an object's cells for suppression. Its root does so too, and is fairer to small objects, whose
     # boxes are never exact.
@@ -135,16 +133,13 @@ def second_look_loss(
     """
     limits = boxes_xyxy.new_tensor((*size, *size))
     boxes = torch.minimum(look.candidates.boxes_xyxy.clamp(min=0), limits)
-    shared, areas = pair_overlap(boxes, boxes_xyxy)
-    sides = boxes_xyxy[..., 2:] - boxes_xyxy[..., :2]
-    others = sides[..., 0] * sides[..., 1]
-    overlap = shared / (areas[..., None] + others[:, None] - shared).clamp(min=1e-6)
+    overlap, inside = pair_overlap(boxes, boxes_xyxy)
     minor = torch.where(boxes[..., 3] - boxes[..., 1] < low_px, MINOR, 1.0)
     total = look.logits.new_zeros(())
     for index in range(look.logits.shape[2]):
         logits, mine = look.logits[..., index], classes == index
         match = match_candidates(logits.detach(), torch.where(mine[:, None], overlap, 0.0))
-        on_unjudged = ((shared / areas[..., None] > _INSIDE) & (mine & (importance < 1))[:, None]).any(dim=2)
+        on_unjudged = ((inside > _INSIDE) & (mine & (importance < 1))[:, None]).any(dim=2)
         weights = torch.where(on_unjudged, 0.0, minor)
         weights = torch.where(match >= 0, importance.gather(1, match.clamp(min=0)), weights)
         wanted = (match >= 0).to(logits)

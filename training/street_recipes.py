@@ -94,7 +94,8 @@ BUDGETS: dict[Device, Budget] = {
         steps={"street_detector": 14000, "street_fields": 6000, "street_coco17": 9000, "street_car24": 4000},
     ),
 }  # fmt: skip
-"""Two cores in under an hour; one GPU with sixteen cores in under ten minutes, from which the shipped models come."""
+"""Two cores in under an hour; one GPU with sixteen cores in under ten minutes, from which the shipped models come, but
+for the detector's second look."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -73,7 +73,7 @@ def best_candidates(first: FirstLook) -> Candidates:
     scores = _log_scores(rows).amax(dim=2)
     index = scores.topk(min(CANDIDATES, scores.shape[1]), dim=1).indices
     found = Candidates(
-        index=index, rows=_pick(rows, index), boxes_xyxy=_decode(_pick(rows, index), cells[index], strides[index]),
+        index=index, rows=_pick(rows, index), boxes_xyxy=decode_boxes(_pick(rows, index), cells[index], strides[index]),
         strides=strides[index], softened=scores.gather(1, index),
     )  # fmt: skip
     softened = _soften(found)
@@ -109,7 +109,8 @@ def _pick(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
     return values.gather(1, index[..., None].expand(-1, -1, values.shape[2]))
 
 
-def _decode(rows: torch.Tensor, cells: torch.Tensor, strides: torch.Tensor) -> torch.Tensor:
+def decode_boxes(rows: torch.Tensor, cells: torch.Tensor, strides: torch.Tensor) -> torch.Tensor:
+    """(..., 4) boxes in input pixels of rows (..., 5 + C), given their cells (..., 2) and strides (...)."""
     centres = (rows[..., :2] + cells) * strides[..., None]
     halves = rows[..., 2:4].clamp(max=MAX_LOG_SIZE).exp() * strides[..., None] / 2
     return torch.cat([centres - halves, centres + halves], dim=-1)
@@ -119,23 +120,31 @@ def _soften(found: Candidates) -> torch.Tensor:
     classes = _log_scores(found.rows).argmax(dim=2)
     scores, boxes = found.softened, found.boxes_xyxy
     better = (scores[:, :, None] > scores[:, None, :]) & (classes[:, :, None] == classes[:, None, :])
-    shared, areas = pair_overlap(boxes, boxes)
-    overlap = shared / (areas[:, :, None] + areas[:, None, :] - shared).clamp(min=1e-6)
+    overlap, inside = pair_overlap(boxes, boxes)
     double = (better & (overlap > _DOUBLE_IOU)).float()
     alive = torch.ones_like(scores)
     for _ in range(_ROUNDS):
         alive = 1 - (double * alive[:, :, None]).amax(dim=1)
-    share = torch.minimum(torch.exp(-(overlap**2) / _SIGMA), 1 - _PART_COST * shared / areas[:, None, :])
+    share = torch.minimum(torch.exp(-(overlap**2) / _SIGMA), 1 - _PART_COST * inside.transpose(1, 2))
     taken = (share.log() * better.float() * alive[:, :, None]).sum(dim=1)
     return (scores + taken).clamp(min=_LEAST) + _LEAST * (1 - alive)
 
 
 def pair_overlap(boxes: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Shared area (N, M, G) of boxes (N, M, 4) with others (N, G, 4), and area (N, M) of the boxes, not below 1e-6."""
+    """Intersection over union of boxes (N, M, 4) with others (N, G, 4), and the share of each that is inside the other.
+
+    Both are (N, M, G); areas below 1e-6 count as that.
+    """
     low = torch.maximum(boxes[:, :, None, :2], others[:, None, :, :2])
     sides = (torch.minimum(boxes[:, :, None, 2:], others[:, None, :, 2:]) - low).clamp(min=0)
-    whole = boxes[..., 2:] - boxes[..., :2]
-    return sides[..., 0] * sides[..., 1], (whole[..., 0] * whole[..., 1]).clamp(min=1e-6)
+    shared, areas, other_areas = sides[..., 0] * sides[..., 1], _areas(boxes), _areas(others)
+    union = (areas[:, :, None] + other_areas[:, None, :] - shared).clamp(min=1e-6)
+    return shared / union, shared / areas[:, :, None]
+
+
+def _areas(boxes: torch.Tensor) -> torch.Tensor:
+    sides = boxes[..., 2:] - boxes[..., :2]
+    return (sides[..., 0] * sides[..., 1]).clamp(min=1e-6)
 
 
 def sample_boxes(features: torch.Tensor, boxes_xyxy: torch.Tensor, stride: int) -> torch.Tensor:
@@ -261,8 +270,7 @@ def _relations(found: Candidates) -> tuple[torch.Tensor, torch.Tensor]:
     """(N, M, M, R) numbers of about one that say how each candidate stands to another, and (N, M, M) 1 where near."""
     boxes, scores = found.boxes_xyxy, found.softened
     sides, middles = _sides_and_middles(boxes)
-    shared, areas = pair_overlap(boxes, boxes)
-    overlap = shared / (areas[:, :, None] + areas[:, None, :] - shared).clamp(min=1e-6)
+    overlap, inside = pair_overlap(boxes, boxes)
     ahead = scores[:, :, None] - scores[:, None, :]
     kinds = found.rows[..., 5:].softmax(dim=2)
     apart = (middles[:, :, None] - middles[:, None]) / sides[:, :, None]
@@ -271,7 +279,7 @@ def _relations(found: Candidates) -> tuple[torch.Tensor, torch.Tensor]:
     itself = torch.eye(boxes.shape[1], device=boxes.device)
     near = (torch.minimum(farthest, farthest.transpose(1, 2)) < _NEAR).float() * (1 - itself)
     parts = [
-        overlap, shared / areas[:, :, None], shared / areas[:, None, :], (overlap > 0.3).float(),
+        overlap, inside, inside.transpose(1, 2), (overlap > 0.3).float(),
         ahead.clamp(-4, 4) / 2, (ahead > 0).float(), kinds @ kinds.transpose(1, 2),
         *apart.clamp(-3, 3).unbind(dim=3), *larger.clamp(-3, 3).unbind(dim=3),
         scores[:, None, :].expand_as(overlap).clamp(min=-6) / 3,
