@@ -119,16 +119,19 @@ def test_each_object_is_chosen_once_and_the_best_candidate_chooses_first() -> No
 
 
 def test_the_second_loss_asks_for_one_candidate_of_each_judged_object() -> None:
-    boxes = [[20.0, 20, 60, 80], [22, 20, 62, 80], [100, 20, 140, 80], [200, 20, 240, 80], [200, 20, 210, 30]]
+    boxes = [[20.0, 20, 60, 80], [22, 20, 62, 80], [100, 20, 140, 80], [200, 20, 240, 80], [200, 20, 210, 30],
+             [105, 25, 130, 55]]  # fmt: skip
     truth = torch.tensor([[[20.0, 20, 60, 80], [100, 20, 140, 80], [0, 0, 0, 0]]])
     classes, importance = torch.tensor([[0, 1, -1]]), torch.tensor([[1.0, 0.0, 0.0]])
 
-    def loss(*logits: tuple[float, float]) -> float:
-        look = SecondScores(candidates=candidates(boxes), logits=torch.tensor([logits]))
-        return float(second_look_loss(look, truth, classes, importance, size=(WIDTH, HEIGHT), low_px=23.0))
-
     sure, no = 9.0, -9.0
     nothing = (no, no)
+
+    def loss(*logits: tuple[float, float]) -> float:
+        padded = [*logits, *[nothing] * (len(boxes) - len(logits))]
+        look = SecondScores(candidates=candidates(boxes), logits=torch.tensor([padded]))
+        return float(second_look_loss(look, truth, classes, importance, size=(WIDTH, HEIGHT), low_px=23.0))
+
     right = loss((sure, no), nothing, nothing, nothing, nothing)
     assert right < 0.01
     # Either of two doubles will do, but not both, and not neither.
@@ -138,6 +141,10 @@ def test_the_second_loss_asks_for_one_candidate_of_each_judged_object() -> None:
     # The person who is not judged may be found or not, but is no car; what is low costs less than what is high.
     assert loss((sure, no), nothing, (no, sure), nothing, nothing) == pytest.approx(right, abs=1e-3)
     assert loss((sure, no), nothing, (sure, no), nothing, nothing) > 8
+    # Nor is what lies within that person a mistake, unless it is called a car.
+    part = loss((sure, no), nothing, (no, sure), nothing, nothing, (no, sure - 1))
+    assert part == pytest.approx(right, abs=1e-3)
+    assert loss((sure, no), nothing, (no, sure), nothing, nothing, (sure - 1, no)) > 7
     high = loss((sure, no), nothing, nothing, (sure, no), nothing)
     low = loss((sure, no), nothing, nothing, nothing, (sure, no))
     assert low - right == pytest.approx(MINOR * (high - right), rel=1e-3)
@@ -187,6 +194,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[TwoLookDetector,
     torch.manual_seed(1)
     network = TwoLookDetector(2).eval()
     torch.nn.init.normal_(network.second.score.weight, std=0.5)
+    torch.nn.init.constant_(network.second.score.bias, 5.0)
     for listen in network.second.neighbours:
         torch.nn.init.normal_(listen.taken_in.weight, std=0.2)  # type: ignore[union-attr]
     # Weights that half precision holds: a candidate more or less would make all the difference.
@@ -208,6 +216,7 @@ def test_the_graph_scores_candidates_and_nothing_else(exported) -> None:
         first, second = network(pictures)
     assert ((rows[..., 4] > 0).sum(axis=1) <= OBJECTS).all()
     scores = rows[..., 4:5] * rows[..., 5:]
+    assert (scores > 0.2).any()
     for picture in range(2):
         np.testing.assert_allclose(
             scores[picture, second.candidates.index[picture]], second.logits[picture].sigmoid(), atol=0.02
@@ -233,6 +242,7 @@ def test_a_picture_of_nothing_at_all_gives_nothing_and_no_nan(exported, tmp_path
     with torch.no_grad():
         network.first.head.weight[4:] = 0
         network.first.head.bias[4:] = -200.0
+        network.second.score.bias.zero_()
     card = export_model(TwoLookGraph(network), CARD, tmp_path)
     rows = run_graph(tmp_path / card.file, torch.full((1, 3, HEIGHT, WIDTH), 114.0))
     assert np.isfinite(rows).all() and not rows[..., 4:].any()
