@@ -28,7 +28,7 @@ from pipelines.model_variants import int8_choice, resized_detector
 from pipelines.peers import rtmlib_detector
 
 TRIVIAL = "nothing found"
-_SIZES = ((864, 576), (480, 320), (352, 224))
+_SIZES = ((768, 512), (480, 320), (352, 224))
 _EVERY = 6
 _REAL_FRAMES = 60
 _LEAST_MS = 0.01

@@ -191,6 +191,18 @@ def test_disturbed_pictures_repeat_with_the_seed() -> None:
     assert (first != other).any()
 
 
+def test_nights_have_lamps_and_headlights_and_nothing_else_is_lit() -> None:
+    grey = np.full((120, 160, 3), 200, np.uint8)
+    dark = AugmentSettings(dusk=0, night=1, blur=0, weather=0, noise=0, noise_sigma=1.01, compression=0)
+    nights = np.stack([disturb(grey, np.random.default_rng(seed), dark) for seed in range(40)])
+    # Of 200, a gain of at most 0.3, colour and grain leave no more than 80 where nothing shines.
+    assert (np.median(nights, axis=(1, 2, 3)) < 80).mean() > 0.8
+    brightest = nights.max(axis=(1, 2, 3))
+    assert (brightest == 255).any() and (brightest < 90).any()
+    lit = nights[:, 80:].astype(float).mean(axis=(1, 2, 3)) - nights[:, :40].astype(float).mean(axis=(1, 2, 3))
+    assert np.quantile(lit, 0.8) > 5, "headlights light the lower part"
+
+
 def field_batch_loss(network: torch.nn.Module, batch: Batch) -> torch.Tensor:
     cif, caf = network(to_input(batch.pictures, "imagenet"))[0]
     return field_loss(cif, *batch.targets[:2]) + field_loss(caf, *batch.targets[2:])

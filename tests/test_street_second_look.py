@@ -173,19 +173,20 @@ def test_batches_tell_which_objects_are_judged() -> None:
     assert [tensor.shape[0] for tensor in batch.targets] == [8] * 6 and len(grids) == 3
     np.testing.assert_array_equal(classes, np.tile([0, 0, 0, 0, 0, 1], (8, 1)))
     np.testing.assert_allclose(importance, np.tile([1, 0.5, 0.5, MINOR, 0, 1], (8, 1)))
-    mirrored = boxes[:, 5, 0] > 768 / 2
+    width = PICTURE_SIZE[0]
+    mirrored = boxes[:, 5, 0] > width / 2
     assert 0 < mirrored.sum() < 8
     plain = objects[5].box_xyxy * PICTURE_SCALE
     for flipped, box, shown in zip(mirrored, boxes[:, 5], batch.pictures, strict=True):
-        wanted = [768 - plain[2], plain[1], 768 - plain[0], plain[3]] if flipped else plain
+        wanted = [width - plain[2], plain[1], width - plain[0], plain[3]] if flipped else plain
         np.testing.assert_allclose(box, wanted, atol=1.01)
         # The white thing in the picture goes where its box would go.
         left = int(np.flatnonzero(shown[310, :, 0])[0])
-        assert left == (768 - 310 if flipped else 300)
+        assert left == (width - 310 if flipped else 300)
     # A moved and disturbed picture has its boxes inside.
     moved = replace(batches, plain_share=0.0)(np.random.default_rng(1))
     there = moved.targets[4] >= 0
-    assert (moved.targets[3][there] >= 0).all() and (moved.targets[3][there] <= 768).all()
+    assert (moved.targets[3][there] >= 0).all() and (moved.targets[3][there] <= width).all()
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +195,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[TwoLookDetector,
     torch.manual_seed(1)
     network = TwoLookDetector(2).eval()
     torch.nn.init.normal_(network.second.score.weight, std=0.5)
-    torch.nn.init.constant_(network.second.score.bias, 5.0)
+    torch.nn.init.constant_(network.second.score.bias, 8.0)
     for listen in network.second.neighbours:
         torch.nn.init.normal_(listen.taken_in.weight, std=0.2)  # type: ignore[union-attr]
     # Weights that half precision holds: a candidate more or less would make all the difference.
@@ -224,6 +225,17 @@ def test_the_graph_scores_candidates_and_nothing_else(exported) -> None:
         np.testing.assert_allclose(rows[picture, :, :4], first.rows[picture, :, :4], atol=0.02)
     found = decode_yolox(rows[0], card, ratio=1.0, width=WIDTH, height=HEIGHT)
     assert len(found) == (scores[0] > card.score_threshold).sum()
+
+
+def test_contrast_folded_into_the_stem_changes_nothing(exported) -> None:
+    network, pictures = exported[0], torch.rand(1, 3, HEIGHT, WIDTH) * 255
+    folded = copy.deepcopy(network)
+    folded.first.fold_contrast()
+    with torch.no_grad():
+        wanted, given = network.first.look(pictures), folded.first.look(pictures)
+    assert folded.first.contrast == 1 and network.first.contrast == 1 / 64
+    torch.testing.assert_close(given.rows, wanted.rows, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(given.fine, wanted.fine, atol=1e-4, rtol=1e-4)
 
 
 def test_the_graph_keeps_to_the_size_of_its_picture(exported, tmp_path: Path, monkeypatch) -> None:

@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 
 _NOISE_SIDE = 1024
+_LIT = 0.7
+"""Of dark pictures: so many have lights in them."""
 _LAMP_COLOUR = np.array([255.0, 244.0, 214.0])
 
 
@@ -35,7 +37,10 @@ def disturb(picture: np.ndarray, rng: np.random.Generator, settings: AugmentSett
     Returns:
         (h, w, 3) uint8 RGB.
     """
-    picture, dark = _relight(picture, rng, settings)
+    day = picture
+    picture, dark = _relight(day, rng, settings)
+    if dark and rng.random() < _LIT:
+        picture = _night_lights(picture, day, rng)
     if rng.random() < settings.blur:
         picture = _smear(picture, rng, settings.blur_px)
     if rng.random() < settings.weather:
@@ -109,6 +114,22 @@ def _relight(picture: np.ndarray, rng: np.random.Generator, settings: AugmentSet
     return cv2.LUT(picture, table[None]), gain < 0.3
 
 
+def _night_lights(dark: np.ndarray, day: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The dark picture with a part of it lit as by headlights, and with lamps that shine in it."""
+    height, width = dark.shape[:2]
+    across, down = rng.uniform(0.3, 0.7) * width, rng.uniform(0.55, 1.1) * height
+    x = np.exp(-(((np.arange(width) - across) / (rng.uniform(0.1, 0.5) * width)) ** 2)).astype(np.float32)
+    y = np.exp(-(((np.arange(height) - down) / (rng.uniform(0.15, 0.5) * height)) ** 2)).astype(np.float32)
+    cone = np.float32(rng.uniform(0.0, 0.5)) * np.outer(y, x)[..., None]
+    lamps = np.zeros((height // 2, width // 2), np.float32)
+    for _ in range(int(rng.integers(0, 9))):
+        place = (int(rng.integers(width // 2)), int(rng.integers(height // 2)))
+        cv2.circle(lamps, place, int(rng.integers(1, 5)), float(rng.uniform(150, 500)), -1, cv2.LINE_AA)
+    glow = lamps + cv2.GaussianBlur(lamps, (0, 0), rng.uniform(1.5, 6.0))
+    shine = cv2.resize(glow, (width, height), interpolation=cv2.INTER_LINEAR)[..., None] * (_LAMP_COLOUR / 255)
+    return np.clip(dark * (1 - cone) + day * cone + shine.astype(np.float32), 0, 255).astype(np.uint8)
+
+
 def _smear(picture: np.ndarray, rng: np.random.Generator, longest_px: int) -> np.ndarray:
     length = int(rng.integers(2, longest_px + 1))
     if rng.random() < 0.3:
@@ -129,7 +150,11 @@ def _rain(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     lengths = rng.uniform(4, 0.08 * height + 5, count)
     lines = np.stack([starts, starts + lengths[:, None] * (slant, 1.0)], axis=1)
     cv2.polylines(streaks, list(np.round(lines).astype(np.int32)), False, int(rng.integers(40, 130)), 1, cv2.LINE_AA)
-    return cv2.add(picture, cv2.merge([streaks] * 3))
+    if rng.random() < 0.5:
+        streaks = cv2.GaussianBlur(streaks, (0, 0), rng.uniform(0.5, 1.0))
+    veil = rng.uniform(0, 0.4)
+    hazy = cv2.addWeighted(picture, 1 - veil, picture, 0.0, veil * rng.uniform(60, 200))
+    return cv2.add(hazy, cv2.merge([streaks] * 3))
 
 
 def _glare(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -315,8 +315,8 @@ class FieldBatches:
     """Width and height of the network's input, multiples of the stride plus 1."""
     count: int
     augment: AugmentSettings
-    scales: tuple[float, float] = (0.62, 0.82)
-    """Around the 11/16 that takes a kept picture to half a frame."""
+    scales: tuple[float, float] = (0.55, 0.73)
+    """Around the 11/18 that takes a kept picture to half a frame."""
 
     def __call__(self, rng: np.random.Generator) -> Batch:
         """One batch: targets are places and values of cif, then of caf, of each schema in turn."""

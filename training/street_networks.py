@@ -15,6 +15,8 @@ from labeling.schemas import keypoint_schema
 
 DETECTOR_STRIDES = (8, 16, 32)
 FIELD_STRIDE = 8
+_MIDDLE_LEVEL, _CONTRAST = 128.0, 1 / 64
+"""A detector's stem sees levels less the one, times the other."""
 MAX_LOG_SIZE = 5.0
 """Sides of no object are more cells than its exponential."""
 
@@ -26,12 +28,12 @@ def conv_unit(inputs: int, outputs: int, *, stride: int = 1, kernel: int = 3) ->
 
 
 class ResidualUnit(nn.Module):
-    """Two 3x3 convolutions around a shortcut (He et al. 2016)."""
+    """Two 3x3 convolutions around a shortcut (He et al. 2016); between them ``waist`` channels."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, waist: int) -> None:
         super().__init__()
-        self.first = conv_unit(width, width)
-        self.second = nn.Sequential(nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width))
+        self.first = conv_unit(width, waist)
+        self.second = nn.Sequential(nn.Conv2d(waist, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(N, width, h, w) to the same shape."""
@@ -42,15 +44,16 @@ class Trunk(nn.Module):
     """A stem at stride 4, then stages at strides 8, 16, ...: each halves the picture, then refines it.
 
     The stem is one large convolution: at stride 2, moving memory costs more than the products. Cell i of any stage is
-    centred on input pixel i * stride.
+    centred on input pixel i * stride. ``waists`` are those of each stage's residual units, by default its width.
     """
 
-    def __init__(self, widths: Sequence[int], depths: Sequence[int]) -> None:
+    def __init__(self, widths: Sequence[int], depths: Sequence[int], waists: Sequence[int] | None = None) -> None:
         super().__init__()
         self.stem = conv_unit(3, widths[0], stride=4, kernel=7)
         stages = []
-        for inputs, width, depth in zip(widths[:-1], widths[1:], depths, strict=True):
-            units = [conv_unit(inputs, width, stride=2), *(ResidualUnit(width) for _ in range(depth))]
+        waists = waists or widths[1:]
+        for inputs, width, depth, waist in zip(widths[:-1], widths[1:], depths, waists, strict=True):
+            units = [conv_unit(inputs, width, stride=2), *(ResidualUnit(width, waist) for _ in range(depth))]
             stages.append(nn.Sequential(*units))
         self.stages = nn.ModuleList(stages)
 
@@ -100,12 +103,14 @@ class StreetDetector(nn.Module):
         *,
         widths: Sequence[int] = (32, 48, 80, 112, 128),
         depths: Sequence[int] = (1, 2, 2, 1),
+        waists: Sequence[int] | None = None,
         width: int = 48,
         towers: Sequence[bool] = (False, True, True),
     ) -> None:
         super().__init__()
         self.fine_channels = widths[0]
-        self.trunk = Trunk(widths, depths)
+        self.contrast = _CONTRAST
+        self.trunk = Trunk(widths, depths, waists)
         self.pyramid = Pyramid(widths[1:], width)
         self.tower = nn.ModuleList(conv_unit(width, width) if built else nn.Identity() for built in towers)
         self.head = nn.Conv2d(width, 5 + classes, 1)
@@ -116,9 +121,18 @@ class StreetDetector(nn.Module):
         """(N, 3, H, W) BGR 0 to 255 to (N, A, 5 + C): offset x, y, log size w, h, then logits."""
         return self.look(pictures).rows
 
+    def fold_contrast(self) -> None:
+        """Take the scaling of levels into the stem's weights: nothing changes but that a picture is read once less."""
+        convolution = self.trunk.stem[0]
+        assert isinstance(convolution, nn.Conv2d)
+        with torch.no_grad():
+            convolution.weight.mul_(self.contrast)
+        self.contrast = 1.0
+
     def look(self, pictures: torch.Tensor) -> "FirstLook":
         """As ``forward``, with the features that led there."""
-        fine = self.trunk.stem(pictures / 64.0 - 2.0)
+        centred = pictures - _MIDDLE_LEVEL
+        fine = self.trunk.stem(centred if self.contrast == 1 else centred * self.contrast)
         levels = self.pyramid(self.trunk.refine(fine))[: len(DETECTOR_STRIDES)]
         towers = [tower(x) for tower, x in zip(self.tower, levels, strict=True)]
         return FirstLook(

@@ -12,9 +12,9 @@ import numpy as np
 from dataset.street import Street, StreetConfig, StreetFrame
 from labeling.schemas import Category
 
-PICTURE_SIZE = (768, 512)
-"""Width and height at which frames are kept: the detector's input; 8/11 of 1056x704."""
-PICTURE_SCALE = 8 / 11
+PICTURE_SIZE = (864, 576)
+"""Width and height at which frames are kept: the detector's input; 9/11 of 1056x704."""
+PICTURE_SCALE = 9 / 11
 """Picture pixels per frame pixel."""
 CROP_MARGIN = 1.8
 """Side of a stored crop relative to the object's box, so that it can still be moved, turned and scaled."""
@@ -50,7 +50,7 @@ class PoolFrame:
     """One frame, scaled down, with its truth at full size."""
 
     picture: np.ndarray
-    """(512, 768, 3) uint8 RGB."""
+    """(576, 864, 3) uint8 RGB."""
     scale: float
     """Picture pixels per frame pixel."""
     objects: tuple[ObjectTruth, ...]

@@ -41,6 +41,8 @@ _WINDOWS = ((416, 288, 6), (*PICTURE_SIZE, 2))
 of the same pictures twice as many find more people."""
 _SECOND_COUNT, _SECOND_RATE = 6, 1e-4
 """Whole pictures of a batch for the second look, and the peak rate at which the first look goes on learning."""
+_SECOND_AUGMENT = AugmentSettings(night=0.15, weather=0.2)
+"""What is taken for an object in bad weather or at night is for the second look to tell."""
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
 _HEAD_WIDTHS = {"car24": (32, 56, 88), "coco17": (32, 56, 88, 72)}
 _HIDDEN_WEIGHTS = {"car24": 1.0, "coco17": 2.0}
@@ -174,7 +176,7 @@ def _detector_recipe(settings: FitSettings, again: FitSettings, enlarge: int) ->
         loss=first_loss,
     )  # fmt: skip
     second = Lesson(
-        batches=lambda pool: SecondLookBatches(pool=pool, count=_SECOND_COUNT * enlarge, augment=AugmentSettings()),
+        batches=lambda pool: SecondLookBatches(pool=pool, count=_SECOND_COUNT * enlarge, augment=_SECOND_AUGMENT),
         fit=again, loss=both_losses, pool="others",
     )  # fmt: skip
     return Recipe(card=card, network=lambda: TwoLookDetector(len(CLASSES)), graph=TwoLookGraph, lessons=(first, second))

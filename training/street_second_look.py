@@ -9,6 +9,7 @@ that of each object one candidate is left: nothing needs to be suppressed afterw
 Shape suffixes as in ``street_networks``; M candidates of a picture, Q points sampled in a box.
 """
 
+import copy
 from dataclasses import dataclass
 
 import torch
@@ -28,6 +29,8 @@ _ROUNDS = 5
 _SIGMA, _PART_COST = 0.4, 0.4
 """Of soft suppression (Bodla et al. 2017) and of parts, from which the second look starts: as they were chosen for the
 first look alone, on the validation streets."""
+_WAISTS = (32, 64, 112, 128)
+"""Of the first look's residual units. At fine strides narrower ones than their stages pay for a larger picture."""
 _LEAST = -9.0
 """Log score of what is as good as nothing."""
 _NOTHING = 0.01
@@ -293,7 +296,7 @@ class TwoLookDetector(nn.Module):
 
     def __init__(self, classes: int) -> None:
         super().__init__()
-        self.first = StreetDetector(classes)
+        self.first = StreetDetector(classes, waists=_WAISTS)
         self.second = SecondLook(classes, fine=self.first.fine_channels, pyramid=self.first.head.in_channels)
 
     def forward(self, pictures: torch.Tensor) -> tuple[FirstLook, SecondScores]:
@@ -317,7 +320,8 @@ class TwoLookGraph(nn.Module):
 
     def __init__(self, network: TwoLookDetector) -> None:
         super().__init__()
-        self.network = network
+        self.network = copy.deepcopy(network)
+        self.network.first.fold_contrast()
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
         """``output`` (N, A, 5 + C); the best class of a candidate is sure to be its class if it is anything."""
