@@ -130,9 +130,11 @@ def letterbox(frame: np.ndarray, card: YoloxCard, *, out: np.ndarray | None = No
     height, width = frame.shape[:2]
     ratio = min(card.input_height / height, card.input_width / width)
     inner = (max(1, int(width * ratio)), max(1, int(height * ratio)))
-    canvas = np.full((card.input_height, card.input_width, 3), LETTERBOX_GREY, np.uint8)
-    canvas[: inner[1], : inner[0]] = cv2.resize(frame, inner, interpolation=cv2.INTER_LINEAR)
-    return network_input(canvas, card, out=out), ratio
+    picture = cv2.resize(frame, inner, interpolation=cv2.INTER_LINEAR)
+    right, below = card.input_width - inner[0], card.input_height - inner[1]
+    if right or below:
+        picture = cv2.copyMakeBorder(picture, 0, below, 0, right, cv2.BORDER_CONSTANT, value=(LETTERBOX_GREY,) * 3)
+    return network_input(picture, card, out=out), ratio
 
 
 def decode_yolox(output: np.ndarray, card: YoloxCard, *, ratio: float, width: int, height: int) -> Detections:

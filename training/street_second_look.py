@@ -73,7 +73,9 @@ def best_candidates(first: FirstLook) -> Candidates:
     """
     rows = first.rows.detach()
     cells, strides = _grid(first.coarse)
-    scores = _log_scores(rows).amax(dim=2)
+    # The best class first, then logarithms: of thousands of cells these are dear.
+    by_value = rows.transpose(1, 2)
+    scores = -functional.softplus(-by_value[:, 4]) - functional.softplus(-by_value[:, 5:].amax(dim=1))
     index = scores.topk(min(CANDIDATES, scores.shape[1]), dim=1).indices
     found = Candidates(
         index=index, rows=_pick(rows, index), boxes_xyxy=decode_boxes(_pick(rows, index), cells[index], strides[index]),
@@ -138,11 +140,17 @@ def pair_overlap(boxes: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tenso
 
     Both are (N, M, G); areas below 1e-6 count as that.
     """
-    low = torch.maximum(boxes[:, :, None, :2], others[:, None, :, :2])
-    sides = (torch.minimum(boxes[:, :, None, 2:], others[:, None, :, 2:]) - low).clamp(min=0)
-    shared, areas, other_areas = sides[..., 0] * sides[..., 1], _areas(boxes), _areas(others)
+    shared = _shared(boxes, others, 0) * _shared(boxes, others, 1)
+    areas, other_areas = _areas(boxes), _areas(others)
     union = (areas[:, :, None] + other_areas[:, None, :] - shared).clamp(min=1e-6)
     return shared / union, shared / areas[:, :, None]
+
+
+def _shared(boxes: torch.Tensor, others: torch.Tensor, axis: int) -> torch.Tensor:
+    """(N, M, G) length that two boxes share along one axis: axis by axis, since rows of two numbers are slow."""
+    low = torch.maximum(boxes[:, :, None, axis], others[:, None, :, axis])
+    high = torch.minimum(boxes[:, :, None, axis + 2], others[:, None, :, axis + 2])
+    return (high - low).clamp(min=0)
 
 
 def _areas(boxes: torch.Tensor) -> torch.Tensor:
@@ -276,15 +284,16 @@ def _relations(found: Candidates) -> tuple[torch.Tensor, torch.Tensor]:
     overlap, inside = pair_overlap(boxes, boxes)
     ahead = scores[:, :, None] - scores[:, None, :]
     kinds = found.rows[..., 5:].softmax(dim=2)
-    apart = (middles[:, :, None] - middles[:, None]) / sides[:, :, None]
-    larger = sides[:, :, None].log() - sides[:, None].log()
-    farthest = apart.abs().amax(dim=3)
+    logs = sides.log()
+    apart = [(middles[:, :, None, i] - middles[:, None, :, i]) / sides[:, :, None, i] for i in (0, 1)]
+    larger = [logs[:, :, None, i] - logs[:, None, :, i] for i in (0, 1)]
+    farthest = torch.maximum(*(one.abs() for one in apart))
     itself = torch.eye(boxes.shape[1], device=boxes.device)
     near = (torch.minimum(farthest, farthest.transpose(1, 2)) < _NEAR).float() * (1 - itself)
     parts = [
         overlap, inside, inside.transpose(1, 2), (overlap > 0.3).float(),
         ahead.clamp(-4, 4) / 2, (ahead > 0).float(), kinds @ kinds.transpose(1, 2),
-        *apart.clamp(-3, 3).unbind(dim=3), *larger.clamp(-3, 3).unbind(dim=3),
+        *(one.clamp(-3, 3) for one in (*apart, *larger)),
         scores[:, None, :].expand_as(overlap).clamp(min=-6) / 3,
         scores[:, :, None].expand_as(overlap).clamp(min=-6) / 3,
     ]  # fmt: skip
