@@ -1,13 +1,17 @@
 """The street models' thresholds, and how bottom-up cars are judged."""
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from labeling.detection import Detections
 from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
+from labeling.model_cards import YoloxCard
 from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, plan_lessons, plan_streets
 from training.street_pool import ObjectTruth
 from training.street_scores import Tally, grouped_standard_error, judge_car_fields
-from training.street_thresholds import BOX_SCORES, best_threshold, judge_count, sure_threshold
+from training.street_thresholds import BOX_SCORES, best_threshold, choose_box_scores, judge_count, sure_threshold
 
 
 def car(left: float, *, height: float = 60.0, share: float = 1.0) -> ObjectTruth:
@@ -116,3 +120,26 @@ def test_frames_of_one_street_count_as_one() -> None:
     outcomes = np.repeat([1.0, 0.0, 1.0, 0.0], 6)
     np.testing.assert_allclose(grouped_standard_error(outcomes.tolist(), 6), np.sqrt(1 / 3) / 2)
     assert grouped_standard_error(outcomes.tolist(), 1) < 0.5 * grouped_standard_error(outcomes.tolist(), 6)
+
+
+def test_sure_is_what_phantoms_in_bad_light_do_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A detector that is right in clear light and sees a second car, at 0.7, wherever light is bad."""
+    there, ghost = car(0), car(400)
+    picture = np.full((704, 1056, 3), 90, np.uint8)
+
+    class Detector:
+        def __init__(self, card: YoloxCard, path: Path) -> None:
+            assert card.score_thresholds == {} and card.score_threshold == BOX_SCORES[0]
+
+        def detect(self, frames: list[np.ndarray]) -> list[Detections]:
+            assert (frames[0] == picture).all() and (frames[1] != picture).any()
+            return [detections([there], [0.9]), detections([there, ghost], [0.9, 0.7])]
+
+    monkeypatch.setattr("training.street_thresholds.Detector", Detector)
+    card = YoloxCard(
+        name="d", file="d.onnx", licence="none", source="here", classes=("car", "person"), input_width=64,
+        input_height=64, categories={"car": "car", "person": "person"}, sure_scores={"car": 0.2},
+    )  # fmt: skip
+    chosen = choose_box_scores(card, Path(), [(picture, (there,))] * 4)
+    assert chosen.score_thresholds == {"car": BOX_SCORES[0], "person": BOX_SCORES[0]}
+    assert chosen.sure_scores == {"car": 0.7, "person": 0.7}, "the ghost scores 0.7, no more"

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dataset.conditions import Condition, apply_condition
 from labeling.detection import Detections, Detector
 from labeling.fields import FieldModel
 from labeling.labels import Keypoints
@@ -19,9 +20,11 @@ SURE_SCORES = tuple(float(value) for value in np.round(np.arange(0.1, 0.96, 0.01
 OBJECT_SCORES = tuple(float(value) for value in np.round(np.arange(0.16, 0.45, 0.03), 2))
 """Of bottom-up objects, to choose from."""
 _LUCK = 0.005
-_FEW_PHANTOMS = 0.0025
-"""Per frame and class, together one frame in two hundred: what a track may begin with. One phantom that is believed is
-shown for as long as it lasts."""
+_BAD_LIGHT: tuple[Condition, ...] = ("dusk", "night", "rain", "glare")
+"""In which sure scores are chosen, since scores mean less there."""
+_FEW_PHANTOMS = 0.005
+"""Per frame, of all classes together: what a track may begin with. One phantom that is believed is shown for as long as
+it lasts."""
 JudgedFrame = tuple[np.ndarray, tuple[ObjectTruth, ...]]
 """(H, W, 3) uint8 RGB, and what is true in it."""
 
@@ -44,27 +47,37 @@ def choose_thresholds(folder: Path, names: Sequence[str], frames: Sequence[Judge
 
 
 def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFrame]) -> YoloxCard:
-    """The card with the best threshold of each class, chosen by its own class's counts, and with its sure score."""
+    """The card with the best threshold of each class, chosen by its own class's counts, and with one sure score.
+
+    Sure is what few phantoms reach in bad light: each frame is looked at again in one of ``_BAD_LIGHT``, in turn.
+    """
     eager = card.model_copy(update={"score_threshold": BOX_SCORES[0], "score_thresholds": {}})
     detector = Detector(eager, folder / card.file)
     exact: dict[str, list[list[bool]]] = {name: [] for name in card.class_names}
-    phantoms: dict[str, list[list[int]]] = {name: [] for name in card.class_names}
-    for rgb, truths in frames:
-        found = detector.detect([rgb])[0]
+    phantoms = np.zeros(len(SURE_SCORES))
+    for number, (rgb, truths) in enumerate(frames):
+        harm = _BAD_LIGHT[number % len(_BAD_LIGHT)]
+        clear, harmed = detector.detect([rgb, apply_condition(rgb, harm, seed=number, frame=number)])
         for name in card.class_names:
-            seen = found.select(found.classes == name)
             mine = [truth for truth in truths if truth.category == card.categories[name]]
+            seen = clear.select(clear.classes == name)
             exact[name].append([sum(judge_count(seen, mine, threshold)) == 0 for threshold in BOX_SCORES])
-            # Matches are made best first: those above a score are the first of all.
-            _, extra = match_boxes(seen.boxes_xyxy, mine)
-            phantoms[name].append([int((seen.scores[extra] > threshold).sum()) for threshold in SURE_SCORES])
+            phantoms += _phantoms_above(harmed.select(harmed.classes == name), mine, SURE_SCORES)
     best = {name: best_threshold(np.mean(rows, axis=0), BOX_SCORES) for name, rows in exact.items()}
-    sure = {
-        name: max(best[name], sure_threshold(np.mean(rows, axis=0), SURE_SCORES)) for name, rows in phantoms.items()
-    }
+    sure = sure_threshold(phantoms / len(frames), SURE_SCORES)
     return card.model_copy(
-        update={"score_threshold": min(best.values()), "score_thresholds": best, "sure_scores": sure}
-    )
+        update={
+            "score_threshold": min(best.values()), "score_thresholds": best,
+            "sure_scores": {name: max(score, sure) for name, score in best.items()},
+        }
+    )  # fmt: skip
+
+
+def _phantoms_above(seen: Detections, truths: Sequence[ObjectTruth], scores: Sequence[float]) -> np.ndarray:
+    """(n,) how many phantoms score more than each of n scores."""
+    # Matches are made best first: those above a score are the first of all.
+    _, extra = match_boxes(seen.boxes_xyxy, truths)
+    return (seen.scores[extra] > np.array(scores)[:, None]).sum(axis=1)
 
 
 def choose_object_scores(card: CifcafCard, folder: Path, frames: Sequence[JudgedFrame]) -> CifcafCard:
