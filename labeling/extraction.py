@@ -29,8 +29,9 @@ from labeling.picture_turn import picture_turn, turn_view
 from labeling.smoothing import SmoothingSettings, drop_unseen, smooth_tracks
 from labeling.tracking import RunTracker, TrackedLook, believed_tracks, drop_brief_tracks
 
-_COVERED_IOU = 0.6
-"""Overlap of two labels of one category of which the lesser is not in view; visible parts overlap by up to 0.55."""
+_COVERED_IOU = 0.7
+"""Overlap of two labels of one category of which the lesser is not in view. Visible parts overlap by up to 0.55, boxes
+that a detector tells apart by somewhat more."""
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
 """What was seen once, or lasts less than a quarter of a second, is taken for a mistake."""

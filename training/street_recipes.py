@@ -87,8 +87,8 @@ PoolName = Literal["first", "others"]
 """Streets that the pictures of a lesson are of."""
 BUDGETS: dict[Device, Budget] = {
     "cpu": Budget(
-        streets=384, other_streets=200, second_steps=2500, enlarge=1, loaders=dict.fromkeys(MODEL_NAMES, 0), jobs=2,
-        steps={"street_detector": 11000, "street_fields": 6000, "street_coco17": 12000, "street_car24": 3000},
+        streets=384, other_streets=200, second_steps=2100, enlarge=1, loaders=dict.fromkeys(MODEL_NAMES, 0), jobs=2,
+        steps={"street_detector": 10500, "street_fields": 6000, "street_coco17": 12000, "street_car24": 3000},
     ),
     "cuda": Budget(
         streets=960, other_streets=800, second_steps=2400, enlarge=4, jobs=4,
