@@ -44,7 +44,7 @@ class EffortSettings:
 
 EFFORTS: dict[Effort, EffortSettings] = {
     "exact": EffortSettings(max_gap=1, max_person_gap=1, max_lane_gap=1, flow_step=0, quiet_gap=1),
-    "balanced": EffortSettings(max_gap=6, max_person_gap=5, max_lane_gap=12, news_gap=3, flow_step=2, max_miss=0.04),
+    "balanced": EffortSettings(max_gap=5, max_person_gap=5, max_lane_gap=12, news_gap=3, flow_step=2, max_miss=0.04),
     "fast": EffortSettings(
         max_gap=12,
         max_person_gap=10,
