@@ -52,7 +52,7 @@ EFFORTS: dict[Effort, EffortSettings] = {
         news_gap=8,
         flow_step=5,
         max_bend=0.05,
-        max_miss=0.08,
+        max_miss=0.12,
         sure_share=0.6,
         sure_looks=1,
     ),
