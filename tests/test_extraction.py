@@ -203,8 +203,8 @@ def test_sources_of_fewer_frames_show_nothing_long_unseen(effort: Effort, every:
 def test_a_picture_that_is_held_at_the_start_makes_no_slow_source() -> None:
     scene = MovingCard(speed=0.5)
     label_with([scene], (scene.render(max(0, t - 8)) for t in range(40)), first_frame=0, effort="balanced")
-    # Frame 9 is the second moment; looks begin four moments apart.
-    assert scene.seen[:2] == [0, 12]
+    # Frame 9 is the second moment; what has just come is looked at again after ``news_gap`` moments.
+    assert scene.seen[:2] == [0, 8 + EFFORTS["balanced"].news_gap]
 
 
 def test_a_source_of_fewer_frames_is_smoothed_over_the_same_time() -> None:
