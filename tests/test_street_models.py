@@ -192,15 +192,17 @@ def test_disturbed_pictures_repeat_with_the_seed() -> None:
 
 
 def test_nights_have_lamps_and_headlights_and_nothing_else_is_lit() -> None:
-    grey = np.full((120, 160, 3), 200, np.uint8)
+    grey = np.full((360, 480, 3), 200, np.uint8)
     dark = AugmentSettings(dusk=0, night=1, blur=0, weather=0, noise=0, noise_sigma=1.01, compression=0)
     nights = np.stack([disturb(grey, np.random.default_rng(seed), dark) for seed in range(40)])
     # Of 200, a gain of at most 0.3, colour and grain leave no more than 80 where nothing shines.
     assert (np.median(nights, axis=(1, 2, 3)) < 80).mean() > 0.8
     brightest = nights.max(axis=(1, 2, 3))
     assert (brightest == 255).any() and (brightest < 90).any()
-    lit = nights[:, 80:].astype(float).mean(axis=(1, 2, 3)) - nights[:, :40].astype(float).mean(axis=(1, 2, 3))
-    assert np.quantile(lit, 0.8) > 5, "headlights light the lower part"
+    below, above = (np.median(part, axis=(1, 2, 3)) for part in (nights[:, 240:], nights[:, :120]))
+    assert np.quantile(below - above, 0.8) > 5, "headlights light the lower part"
+    crops = np.stack([disturb(grey[:128, :96], np.random.default_rng(seed), dark) for seed in range(40)])
+    assert crops.max() < 255, "no lamp hides an object in its crop"
 
 
 def field_batch_loss(network: torch.nn.Module, batch: Batch) -> torch.Tensor:

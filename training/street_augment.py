@@ -9,6 +9,8 @@ import numpy as np
 _NOISE_SIDE = 1024
 _LIT = 0.7
 """Of dark pictures: so many have lights in them."""
+_LAMPS_PER_MEGAPIXEL = 16.0
+"""At most: a whole picture has up to eight, the crop of one object none."""
 _LAMP_COLOUR = np.array([255.0, 244.0, 214.0])
 
 
@@ -122,7 +124,8 @@ def _night_lights(dark: np.ndarray, day: np.ndarray, rng: np.random.Generator) -
     y = np.exp(-(((np.arange(height) - down) / (rng.uniform(0.15, 0.5) * height)) ** 2)).astype(np.float32)
     cone = np.float32(rng.uniform(0.0, 0.5)) * np.outer(y, x)[..., None]
     lamps = np.zeros((height // 2, width // 2), np.float32)
-    for _ in range(int(rng.integers(0, 9))):
+    most = round(_LAMPS_PER_MEGAPIXEL * width * height / 1e6)
+    for _ in range(int(rng.integers(0, most + 1))):
         place = (int(rng.integers(width // 2)), int(rng.integers(height // 2)))
         cv2.circle(lamps, place, int(rng.integers(1, 5)), float(rng.uniform(150, 500)), -1, cv2.LINE_AA)
     glow = lamps + cv2.GaussianBlur(lamps, (0, 0), rng.uniform(1.5, 6.0))

@@ -60,6 +60,10 @@ _FIELD_DECODING: dict[str, dict[str, float]] = {
     "lane24": {"point_threshold": 0.3, "instance_threshold": 0.28, "min_points": 4},
 }
 _LICENCE = "Apache-2.0"
+_DETECTOR_SOURCE = (
+    "ships with Animatic; its first look was trained by `make street-models DEVICE=cuda`, which trains and exports the "
+    "same network from seeds; README tells how it went on"
+)
 _SOURCE = "ships with Animatic; `make street-models DEVICE=cuda` trains and exports it again from seeds"
 
 
@@ -97,7 +101,7 @@ BUDGETS: dict[Device, Budget] = {
     ),
 }  # fmt: skip
 """Two cores in under an hour; one GPU with sixteen cores in under ten minutes, from which the shipped models come, but
-for the detector's second look."""
+for the detector, which went on from there (README)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,7 +170,7 @@ def _detector_recipe(settings: FitSettings, again: FitSettings, enlarge: int) ->
         return cell_loss(first.rows, batch) + 0.5 * judged
 
     card = YoloxCard(
-        name=settings.name, file=f"{settings.name}.onnx", licence=_LICENCE, source=_SOURCE, classes=CLASSES,
+        name=settings.name, file=f"{settings.name}.onnx", licence=_LICENCE, source=_DETECTOR_SOURCE, classes=CLASSES,
         categories={name: name for name in CLASSES}, input_width=PICTURE_SIZE[0], input_height=PICTURE_SIZE[1],
         # The second look leaves one box of each object.
         score_threshold=0.4, nms_threshold=1.0, max_detections=OBJECTS,
