@@ -101,8 +101,8 @@ def test_no_label_is_covered_by_a_better_one_of_its_kind() -> None:
     over = replace(first, track_id=1, score=0.5, box_xyxy=first.box_xyxy + 6)
     other = replace(over, category="person", track_id=3)
     later = replace(over, frame=4)
-    # An overlap of 0.64: a detector tells such cars apart, one a third in view behind the other.
-    beside = replace(over, track_id=4, box_xyxy=first.box_xyxy + np.array([21, 0, 21, 0], np.float32))
+    # An overlap of 0.65: a detector tells such cars apart, one a third in view behind the other.
+    beside = replace(over, track_id=4, box_xyxy=first.box_xyxy + np.array([17, 0, 17, 0], np.float32))
     kept = without_doubles([over, first, far, other, later, beside])
     assert [(label.frame, label.track_id) for label in kept] == [(3, 0), (3, 2), (3, 3), (3, 4), (4, 1)]
 

@@ -27,6 +27,7 @@ from training.street_second_look import (
     SecondScores,
     TwoLookDetector,
     TwoLookGraph,
+    _relations,
     best_candidates,
     sample_boxes,
 )
@@ -102,6 +103,19 @@ def test_features_are_sampled_where_the_box_is() -> None:
     wide, high = 8 + 16 * (np.arange(4) + 0.5) / 4, 4 + 36 * (np.arange(6) + 0.5) / 6
     np.testing.assert_allclose(sampled[0, 0, :, 0].reshape(6, 4), np.tile(wide, (6, 1)), atol=1e-4)
     np.testing.assert_allclose(sampled[0, 0, :, 1].reshape(6, 4), np.tile(high[:, None], (1, 4)), atol=1e-4)
+
+
+def test_how_candidates_stand_to_one_another_is_what_the_shipped_weights_learnt() -> None:
+    """Order and signs: a graph exported with others would judge by nonsense."""
+    found = candidates([[20, 20, 60, 80], [40, 20, 60, 50], [200, 100, 240, 160]])
+    values, near = _relations(replace(found, softened=torch.tensor([[-1.0, -3.0, -1.0]])))
+    # Half as wide and high, a quarter of the area, wholly inside: 10 px right and 15 px up of a middle, of 40 by 60.
+    ln2 = float(np.log(2))
+    wanted = [0.25, 0.25, 1, 0, 1, 1, 0.5, -0.25, 0.25, ln2, ln2, -1, -1 / 3]
+    back = [0.25, 1, 0.25, 0, -1, 0, 0.5, 0.5, -0.5, -ln2, -ln2, -1 / 3, -1]
+    np.testing.assert_allclose(values[0, 0, 1], wanted, atol=1e-6)
+    np.testing.assert_allclose(values[0, 1, 0], back, atol=1e-6)
+    np.testing.assert_array_equal(near[0], [[0, 1, 0], [1, 0, 0], [0, 0, 0]])
 
 
 def test_an_untrained_second_look_says_what_the_first_did() -> None:
