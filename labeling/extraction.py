@@ -27,7 +27,7 @@ from labeling.labels import UNTRACKED, Keypoints
 from labeling.observation import Look, looks_of
 from labeling.picture_turn import picture_turn, turn_view
 from labeling.smoothing import SmoothingSettings, drop_unseen, smooth_tracks
-from labeling.tracking import RunTracker, TrackedLook, believed_tracks, drop_brief_tracks
+from labeling.tracking import RunTracker, TrackedLook, believed_tracks, drop_brief_tracks, trim_doubt
 
 _COVERED_IOU = 0.7
 """Overlap of two labels of one category of which the lesser is not in view. Visible parts overlap by up to 0.55, boxes
@@ -35,6 +35,10 @@ that a detector tells apart by somewhat more."""
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
 """What was seen once, or lasts less than a quarter of a second, is taken for a mistake."""
+_SURE_PART, _PLAIN_SHARE = 0.5, 0.9
+"""Where scores are decided: a track is believed if half of its looks are sure of it. It begins with a look that is
+nearly sure, since of what comes out from behind something the first sure look is late, and is shown from one to
+another."""
 _SAMPLE, _SAME_LEVELS = 16, 2
 """Every so many pixels are compared before all are; and by how many levels they may differ."""
 _PACE_MOMENTS = 9
@@ -184,7 +188,9 @@ class _Channel:
         self.labels: list[Keypoints] = []
         self.looks = 0
         self.sure_scores = {category: settings.sure_share * score for category, score in look.sure_scores.items()}
-        self._tracker = RunTracker(sure_scores=self.sure_scores)
+        share = _PLAIN_SHARE if look.decided else 1.0
+        self.plain_scores = {category: share * score for category, score in self.sure_scores.items()}
+        self._tracker = RunTracker(start_scores=self.plain_scores)
         self._forget()
 
     def _forget(self) -> None:
@@ -227,10 +233,12 @@ class _Channel:
         if self._latest and self._latest[1] != self._between.frame:
             self._look(*self._latest)
         believed = believed_tracks(
-            self._looks, min_looks=_MIN_LOOKS, sure_looks=self.settings.sure_looks, sure_scores=self.sure_scores
-        )
+            self._looks, min_looks=_MIN_LOOKS, sure_looks=self.settings.sure_looks,
+            sure_part=_SURE_PART if self.look.decided else 0.0, sure_scores=self.sure_scores,
+        )  # fmt: skip
         self._labels = [label for label in self._labels if label.track_id in believed]
-        self.labels += self._labels + reach_back(self._looks, believed)
+        found = self._labels + reach_back(self._looks, believed)
+        self.labels += trim_doubt(found, least_scores=self.plain_scores) if self.look.decided else found
 
     def _look(self, views: _Views, number: int) -> None:
         if self._between.arriving(number):

@@ -104,7 +104,10 @@ class YoloxCard(ModelCard, frozen=True):
     score_thresholds: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=dict)
     """Class name to a threshold of its own, in place of ``score_threshold``."""
     sure_scores: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=dict)
-    """Class name to the least score at which an object may begin a track; 0.5 where nothing is said."""
+    """Class name to the score from which an object is surely there; 0.5 where nothing is said."""
+    decided_scores: bool = False
+    """Whether what is plainly seen scores near 1. Most detectors are never sure of what is far; of this one's objects
+    half of the looks must be sure."""
     nms_threshold: float = Field(default=0.45, gt=0, le=1)
     """Overlap with a better box of its class above which a box goes."""
     soft_nms: SoftSuppression | None = None
@@ -136,7 +139,7 @@ class YoloxCard(ModelCard, frozen=True):
 
     @property
     def category_sure_scores(self) -> dict[str, float]:
-        """The least score at which an object of each category may begin a track: that of its most trusted class."""
+        """The score from which an object of each category is surely there: that of its most trusted class."""
         scores: dict[str, float] = {}
         for name, category in self.categories.items():
             scores[category] = min(scores.get(category, 1.0), self.sure_scores.get(name, DEFAULT_SURE_SCORE))

@@ -25,7 +25,9 @@ class Look(Protocol):
     carries: bool
     """Whether the points it gives lie on things that optical flow can follow."""
     sure_scores: Mapping[str, float]
-    """Objects of each category that score at least this may begin a track."""
+    """Objects of each category that score at least this are surely there; a category that is not named has no doubt."""
+    decided: bool
+    """Whether what it sees plainly scores near 1, so that an object may be asked to be sure in most looks."""
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """Untracked labels of an (H, W, 3) uint8 RGB frame, numbered ``number``."""
@@ -64,6 +66,7 @@ class ObjectLook:
         assert extractors.detector is not None
         self.extractors, self.categories = extractors, categories
         self.sure_scores: Mapping[str, float] = extractors.detector.card.category_sure_scores
+        self.decided = extractors.detector.card.decided_scores
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""
@@ -96,10 +99,13 @@ class ObjectLook:
 class FieldLook:
     """Objects of a bottom-up network."""
 
+    decided = False
+
     def __init__(self, model: FieldModel, categories: Sequence[Category]) -> None:
         self.model, self.categories = model, categories
         self.carries = list(categories) != ["lane"]
-        self.sure_scores: Mapping[str, float] = dict.fromkeys(categories, _SURE_OBJECT_SCORE)
+        bodies = [category for category in categories if category != "lane"]
+        self.sure_scores: Mapping[str, float] = dict.fromkeys(bodies, _SURE_OBJECT_SCORE)
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""

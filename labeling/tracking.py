@@ -27,13 +27,13 @@ class RunTracker:
 
     Args:
         settings: of every category.
-        sure_scores: a ``high_score`` of its own for each category, in place of the settings'.
+        start_scores: a ``high_score`` of its own for each category, in place of the settings'.
     """
 
     def __init__(
-        self, settings: TrackerSettings | None = None, *, sure_scores: Mapping[str, float] | None = None
+        self, settings: TrackerSettings | None = None, *, start_scores: Mapping[str, float] | None = None
     ) -> None:
-        self._settings, self._sure_scores = settings or TrackerSettings(), dict(sure_scores or {})
+        self._settings, self._start_scores = settings or TrackerSettings(), dict(start_scores or {})
         self._trackers: dict[str, BoxTracker | LaneTracker] = {}
         self._next_id = 0
         self._frame: int | None = None
@@ -79,19 +79,21 @@ class RunTracker:
     def _new_tracker(self, category: str) -> "BoxTracker | LaneTracker":
         if category == "lane":
             return LaneTracker()
-        sure = self._sure_scores.get(category, self._settings.high_score)
-        return BoxTracker(replace(self._settings, high_score=sure))
+        least = self._start_scores.get(category, self._settings.high_score)
+        return BoxTracker(replace(self._settings, high_score=least))
 
 
 def believed_tracks(
-    looks: Iterable[TrackedLook], *, min_looks: int, sure_looks: int = 0, sure_scores: Mapping[str, float] | None = None
-) -> frozenset[int]:
+    looks: Iterable[TrackedLook], *, min_looks: int, sure_looks: int = 0, sure_part: float = 0.0,
+    sure_scores: Mapping[str, float] | None = None,
+) -> frozenset[int]:  # fmt: skip
     """Ids of the tracks that are more than a network's mistake: seen often enough, and surely enough.
 
     Args:
         looks: with their tracks; what was carried or lent between them is no look.
         min_looks: how often it must have been seen.
         sure_looks: how many of the looks must have been sure.
+        sure_part: which part of them, 0 to 1: of a mistake that is looked at often some looks are sure.
         sure_scores: by category, the score from which a look is sure; any score where nothing is said.
     """
     sure_scores = sure_scores or {}
@@ -100,7 +102,31 @@ def believed_tracks(
     for label in (label for look in looks for label in look.labels if label.track_id != UNTRACKED):
         seen[label.track_id] += 1
         sure[label.track_id] += label.score >= sure_scores.get(label.category, 0.0)
-    return frozenset(i for i, count in seen.items() if count >= min_looks and sure[i] >= sure_looks)
+    return frozenset(
+        i for i, count in seen.items() if count >= min_looks and sure[i] >= max(sure_looks, sure_part * count)
+    )
+
+
+def trim_doubt(labels: Iterable[Keypoints], *, least_scores: Mapping[str, float]) -> list[Keypoints]:
+    """Each track from the first frame in which it is plain to the last.
+
+    Where something comes into view or goes out of it little of it shows, and a box is as often beside it as on it. What
+    is doubtful in between is kept: it was there before and is there again.
+
+    Args:
+        labels: tracked.
+        least_scores: by category, the score from which a label is plain; any score where nothing is said.
+    """
+    labels = list(labels)
+    plain: dict[int, list[int]] = {}
+    for label in labels:
+        if label.score >= least_scores.get(label.category, 0.0):
+            plain.setdefault(label.track_id, []).append(label.frame)
+    spans = {track_id: (min(frames), max(frames)) for track_id, frames in plain.items()}
+    return [
+        label for label in labels
+        if label.track_id in spans and spans[label.track_id][0] <= label.frame <= spans[label.track_id][1]
+    ]  # fmt: skip
 
 
 def drop_brief_tracks(

@@ -56,10 +56,12 @@ class TrackClip:
     looks: tuple[tuple[Keypoints, ...], ...]
     sure_scores: Mapping[str, float]
     """Of the detector that looked."""
+    decided: bool
+    """As ``Look.decided``."""
 
     def look(self) -> Look:
         """The same looks again, at no cost."""
-        return Remembered(self.looks, self.sure_scores)
+        return Remembered(self.looks, self.sure_scores, decided=self.decided)
 
 
 class Remembered:
@@ -67,8 +69,10 @@ class Remembered:
 
     carries = True
 
-    def __init__(self, looks: Sequence[Sequence[Keypoints]], sure_scores: Mapping[str, float]) -> None:
-        self.looks, self.sure_scores = looks, sure_scores
+    def __init__(
+        self, looks: Sequence[Sequence[Keypoints]], sure_scores: Mapping[str, float], *, decided: bool
+    ) -> None:
+        self.looks, self.sure_scores, self.decided = looks, sure_scores, decided
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""
@@ -115,7 +119,7 @@ def look_at(clip: KeypointClip) -> TrackClip:
     """Cars and people as the shipped models see them in every frame."""
     look = looks_of(street_extractors())[0]
     looks = tuple(tuple(look.see(frame, n)) for n, frame in enumerate(clip.frames))
-    return TrackClip(clip=clip, looks=looks, sure_scores=look.sure_scores)
+    return TrackClip(clip=clip, looks=looks, sure_scores=look.sure_scores, decided=look.decided)
 
 
 def without_ids(clip: TrackClip) -> list[Keypoints]:
@@ -150,7 +154,7 @@ def greedy_overlap(clip: TrackClip) -> list[Keypoints]:
 
 def tracked(clip: TrackClip, *, turns: bool = True, settings: TrackerSettings | None = None) -> list[Keypoints]:
     """Our tracker at every frame, with or without the camera's turn; raw points."""
-    tracker, view, found = RunTracker(settings, sure_scores=clip.sure_scores), None, []
+    tracker, view, found = RunTracker(settings, start_scores=clip.sure_scores), None, []
     for number, (frame, labels) in enumerate(zip(clip.clip.frames, clip.looks, strict=True)):
         before, view = view, turn_view(frame) if turns else None
         height, width = frame.shape[:2]

@@ -20,6 +20,7 @@ class MovingCard:
 
     carries = True
     sure_scores: Mapping[str, float] = {"car": 0.5}
+    decided: bool = False
 
     def __init__(
         self, *, speed: float = 2.0, growth: float = 0.0, cut: int | None = None, shown: range = range(999)

@@ -67,6 +67,38 @@ def test_who_looks_rarely_believes_sooner(effort: Effort, sure: float, shown: in
     assert len(labels) == shown
 
 
+class Scored(MovingCard):
+    """A card that scores otherwise in every look; sure from 0.8 on."""
+
+    sure_scores: Mapping[str, float] = {"car": 0.8}
+
+    def __init__(self, scores: Sequence[float], *, decided: bool) -> None:
+        super().__init__()
+        self.scores, self.decided = scores, decided
+
+    def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
+        return [replace(label, score=self.scores[number]) for label in super().see(frame, number)]
+
+
+_COMES = (*[0.5] * 6, 0.75, *[0.9] * 8, 0.5, *[0.9] * 7, 0.75, *[0.5] * 6)
+
+
+@pytest.mark.parametrize(
+    ("scores", "decided", "shown"),
+    [
+        (_COMES, True, range(6, 24)),
+        # Its first sure look is that of frame 7, and it reaches back.
+        (_COMES, False, range(30)),
+        ((*[0.9] * 5, *[0.6] * 25), True, range(0)),
+        ((*[0.9] * 5, *[0.6] * 25), False, range(30)),
+    ],
+)
+def test_decided_scores_are_asked_for_more(scores: Sequence[float], decided: bool, shown: range) -> None:
+    scene = Scored(scores, decided=decided)
+    labels = label_with([scene], (scene.render(t) for t in range(len(scores))), first_frame=0, effort="exact")
+    assert [label.frame for label in labels] == list(shown)
+
+
 class ShownInOrder(MovingCard):
     """A card whose frames are shown in some order; it is told the number of the frame that it sees."""
 

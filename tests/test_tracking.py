@@ -12,7 +12,7 @@ from labeling.box_tracker import BoxTracker, TrackerSettings
 from labeling.boxes import iou
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.lane_tracker import LaneTracker, line_distance
-from labeling.tracking import RunTracker, TrackedLook, believed_tracks, drop_brief_tracks
+from labeling.tracking import RunTracker, TrackedLook, believed_tracks, drop_brief_tracks, trim_doubt
 
 
 def box(x: float, y: float = 300, *, width: float = 40, height: float = 100) -> np.ndarray:
@@ -115,9 +115,9 @@ def test_unsure_boxes_continue_a_track_but_start_none() -> None:
     assert first == second
 
 
-def test_each_category_may_be_sure_at_a_score_of_its_own() -> None:
+def test_each_category_may_begin_at_a_score_of_its_own() -> None:
     for sure, begun in ((0.95, 0), (0.85, 1)):
-        tracker = RunTracker(sure_scores={"car": sure})
+        tracker = RunTracker(start_scores={"car": sure})
         (named,) = tracker.update([car(0, 100)], frame=0)
         assert (named.track_id != UNTRACKED) is bool(begun)
 
@@ -188,6 +188,25 @@ def test_a_track_that_was_sure_only_once_is_not_believed() -> None:
         seen = looks(*([replace(car(t, 100), score=0.9 if t in sure else 0.4)] for t in range(10)))
         assert believed_tracks(seen, min_looks=2, sure_looks=2, sure_scores={"car": 0.5}) == believed
         assert believed_tracks(seen, min_looks=2) == {0}
+
+
+@pytest.mark.parametrize(("sure", "believed"), [((0, 3, 5, 8, 9), {0}), ((0, 3, 5, 8), set())])
+def test_half_of_the_looks_may_have_to_be_sure(sure: tuple[int, ...], believed: set[int]) -> None:
+    seen = looks(*([replace(car(t, 100), score=0.9 if t in sure else 0.6)] for t in range(10)))
+    scores = {"car": 0.8}
+    assert believed_tracks(seen, min_looks=2, sure_looks=2, sure_part=0.5, sure_scores=scores) == believed
+    assert believed_tracks(seen, min_looks=2, sure_looks=2, sure_scores=scores) == {0}
+
+
+def test_a_track_is_shown_from_its_first_plain_frame_to_its_last() -> None:
+    """What is doubtful before and after goes; in between it stays, and so does what has no doubt."""
+    plain = {3, 4, 9}
+    track = [replace(car(t, 100), track_id=0, score=0.8 if t in plain else 0.5) for t in range(12)]
+    doubtful = [replace(label, track_id=1, score=0.79) for label in track]
+    lane = [replace(label, track_id=2, category="lane", schema="lane24") for label in track]
+    shown = trim_doubt([*track, *doubtful, *lane], least_scores={"car": 0.8})
+    assert shown == [*track[3:10], *lane]
+    assert trim_doubt(track, least_scores={}) == track
 
 
 def test_brief_tracks_are_dropped_but_where_a_run_begins_or_ends() -> None:

@@ -47,7 +47,7 @@ def judge_street(plan: RenderPlan) -> dict[str, tuple[list[bool], TrackScore]]:
     alone = [label for labels in seen for label in labels]
     results = {SINGLE: ([is_exact(frame) for frame in match_frames(alone, truth)], NO_TRACKS)}
     for effort in get_args(Effort):
-        again = Remembered(seen, look.sure_scores)
+        again = Remembered(seen, look.sure_scores, decided=look.decided)
         labels = label_with([again], [frame.rgb for frame in rendered], first_frame=0, effort=effort)
         exact = [is_exact(frame) for frame in match_frames(labels, truth)]
         results[effort] = (exact, track_score(labels, truth))
