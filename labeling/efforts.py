@@ -37,9 +37,9 @@ class EffortSettings:
     """A network that has seen nothing for so long looks only every ``quiet_gap`` frames."""
     quiet_gap: int = 12
     sure_share: float = 1.0
-    """Of the detector's sure scores, at which a track may begin: who looks rarely must believe sooner."""
+    """Of the detector's sure scores, what counts as sure: who looks rarely must believe sooner."""
     sure_looks: int = 2
-    """Looks that must be sure of an object for it to be believed; where they are rare, one must do."""
+    """Looks in a row that must be sure of an object for it to be believed; where they are rare, one must do."""
 
 
 EFFORTS: dict[Effort, EffortSettings] = {

@@ -35,10 +35,9 @@ that a detector tells apart by somewhat more."""
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
 """What was seen once, or lasts less than a quarter of a second, is taken for a mistake."""
-_SURE_PART, _PLAIN_SHARE = 0.5, 0.9
-"""Where scores are decided: a track is believed if half of its looks are sure of it. It begins with a look that is
-nearly sure, since of what comes out from behind something the first sure look is late, and is shown from one to
-another."""
+_BEGIN_SHARE, _PLAIN_SHARE = 0.9, 0.8
+"""Of sure scores. A track begins with a look that is nearly sure: the first sure one at what comes out from behind
+something is late. Where scores are decided, it is shown from one plain look to another."""
 _SAMPLE, _SAME_LEVELS = 16, 2
 """Every so many pixels are compared before all are; and by how many levels they may differ."""
 _PACE_MOMENTS = 9
@@ -188,9 +187,11 @@ class _Channel:
         self.labels: list[Keypoints] = []
         self.looks = 0
         self.sure_scores = {category: settings.sure_share * score for category, score in look.sure_scores.items()}
-        share = _PLAIN_SHARE if look.decided else 1.0
-        self.plain_scores = {category: share * score for category, score in self.sure_scores.items()}
-        self._tracker = RunTracker(start_scores=self.plain_scores)
+        begin, self.plain_scores = (
+            {category: share * score for category, score in self.sure_scores.items()}
+            for share in (_BEGIN_SHARE, _PLAIN_SHARE)
+        )
+        self._tracker = RunTracker(start_scores=begin)
         self._forget()
 
     def _forget(self) -> None:
@@ -233,9 +234,8 @@ class _Channel:
         if self._latest and self._latest[1] != self._between.frame:
             self._look(*self._latest)
         believed = believed_tracks(
-            self._looks, min_looks=_MIN_LOOKS, sure_looks=self.settings.sure_looks,
-            sure_part=_SURE_PART if self.look.decided else 0.0, sure_scores=self.sure_scores,
-        )  # fmt: skip
+            self._looks, min_looks=_MIN_LOOKS, sure_looks=self.settings.sure_looks, sure_scores=self.sure_scores
+        )
         self._labels = [label for label in self._labels if label.track_id in believed]
         found = self._labels + reach_back(self._looks, believed)
         self.labels += trim_doubt(found, least_scores=self.plain_scores) if self.look.decided else found

@@ -106,8 +106,8 @@ class YoloxCard(ModelCard, frozen=True):
     sure_scores: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=dict)
     """Class name to the score from which an object is surely there; 0.5 where nothing is said."""
     decided_scores: bool = False
-    """Whether what is plainly seen scores near 1. Most detectors are never sure of what is far; of this one's objects
-    half of the looks must be sure."""
+    """Whether what is plainly seen scores near 1, so that what comes into view, or leaves it, is shown while it scores
+    nearly so. Most detectors are never sure of what is far."""
     nms_threshold: float = Field(default=0.45, gt=0, le=1)
     """Overlap with a better box of its class above which a box goes."""
     soft_nms: SoftSuppression | None = None

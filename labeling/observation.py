@@ -27,7 +27,7 @@ class Look(Protocol):
     sure_scores: Mapping[str, float]
     """Objects of each category that score at least this are surely there; a category that is not named has no doubt."""
     decided: bool
-    """Whether what it sees plainly scores near 1, so that an object may be asked to be sure in most looks."""
+    """Whether what it sees plainly scores near 1: what does not is hardly in view."""
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """Untracked labels of an (H, W, 3) uint8 RGB frame, numbered ``number``."""

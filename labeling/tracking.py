@@ -84,27 +84,27 @@ class RunTracker:
 
 
 def believed_tracks(
-    looks: Iterable[TrackedLook], *, min_looks: int, sure_looks: int = 0, sure_part: float = 0.0,
-    sure_scores: Mapping[str, float] | None = None,
-) -> frozenset[int]:  # fmt: skip
+    looks: Iterable[TrackedLook], *, min_looks: int, sure_looks: int = 0, sure_scores: Mapping[str, float] | None = None
+) -> frozenset[int]:
     """Ids of the tracks that are more than a network's mistake: seen often enough, and surely enough.
 
     Args:
         looks: with their tracks; what was carried or lent between them is no look.
         min_looks: how often it must have been seen.
-        sure_looks: how many of the looks must have been sure.
-        sure_part: which part of them, 0 to 1: of a mistake that is looked at often some looks are sure.
+        sure_looks: how many of the looks, one after another, must have been sure: of a mistake that is looked at often
+            some are, now and then.
         sure_scores: by category, the score from which a look is sure; any score where nothing is said.
     """
     sure_scores = sure_scores or {}
     seen: Counter[int] = Counter()
-    sure: Counter[int] = Counter()
+    run: Counter[int] = Counter()
+    longest: Counter[int] = Counter()
     for label in (label for look in looks for label in look.labels if label.track_id != UNTRACKED):
-        seen[label.track_id] += 1
-        sure[label.track_id] += label.score >= sure_scores.get(label.category, 0.0)
-    return frozenset(
-        i for i, count in seen.items() if count >= min_looks and sure[i] >= max(sure_looks, sure_part * count)
-    )
+        track_id = label.track_id
+        seen[track_id] += 1
+        run[track_id] = run[track_id] + 1 if label.score >= sure_scores.get(label.category, 0.0) else 0
+        longest[track_id] = max(longest[track_id], run[track_id])
+    return frozenset(i for i, count in seen.items() if count >= min_looks and longest[i] >= sure_looks)
 
 
 def trim_doubt(labels: Iterable[Keypoints], *, least_scores: Mapping[str, float]) -> list[Keypoints]:
