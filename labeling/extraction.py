@@ -10,7 +10,7 @@ must last, and how long after its last sight it may be shown, go by time: they c
 of a picture that is shown for longer than is usual in its source.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from labeling.backward_tracking import reach_back
 from labeling.between_looks import BetweenLooks
+from labeling.boxes import inside
 from labeling.carrying import small_grey
 from labeling.detection import suppress_overlaps
 from labeling.efforts import EFFORTS, Effort, EffortSettings, Rhythm
@@ -35,9 +36,11 @@ that a detector tells apart by somewhat more."""
 _MIN_LOOKS = 2
 _MIN_FRAMES = 6
 """What was seen once, or lasts less than a quarter of a second, is taken for a mistake."""
-_BEGIN_SHARE, _PLAIN_SHARE = 0.9, 0.8
+_BEGIN_SHARE, _PLAIN_SHARE, _DOUBT_SHARE = 0.9, 0.8, 0.95
 """Of sure scores. A track begins with a look that is nearly sure: the first sure one at what comes out from behind
-something is late. Where scores are decided, it is shown from one plain look to another."""
+something is late. Where scores are decided, it is shown from one plain look to another; and what is not quite sure and
+half behind a better label of its kind is that one's double, or hardly in view."""
+_HALF_COVERED = 0.5
 _SAMPLE, _SAME_LEVELS = 16, 2
 """Every so many pixels are compared before all are; and by how many levels they may differ."""
 _PACE_MOMENTS = 9
@@ -101,7 +104,9 @@ def label_with(
     labels = _renumbered([channel.labels for channel in channels])
     fresh = frozenset(moment for moment, number in enumerate(moments) if number in breaks)
     windows = SmoothingSettings().at_pace(_pace(moments))
-    labels = drop_unseen(without_doubles(smooth_tracks(labels, settings=windows, breaks=fresh)), clocks)
+    smooth = smooth_tracks(labels, settings=windows, breaks=fresh)
+    doubts = {category: score for channel in channels for category, score in channel.doubts.items()}
+    labels = drop_unseen(without_doubles(smooth, doubts=doubts), clocks)
     labels = _on_grid(labels, shown, first_frame=first_frame)
     last = first_frame + len(shown) - 1
     ends = {first_frame, last, *breaks, *(number - 1 for number in breaks)}
@@ -118,11 +123,16 @@ def _pace(moments: Sequence[int]) -> int:
     return int(gaps[(len(gaps) - 1) // 2]) if len(gaps) > 1 else 1
 
 
-def without_doubles(labels: Iterable[Keypoints]) -> list[Keypoints]:
+def without_doubles(labels: Iterable[Keypoints], *, doubts: Mapping[str, float] | None = None) -> list[Keypoints]:
     """Labels of which none is covered by a better one of its category in the same frame.
 
     Objects in view never cover each other so; what is carried or smoothed on while something steps before it does.
+
+    Args:
+        labels: of any frames.
+        doubts: by category, the score below which to be half covered is enough.
     """
+    doubts = doubts or {}
     groups: dict[tuple[int, str], list[Keypoints]] = {}
     for label in labels:
         groups.setdefault((label.frame, label.category), []).append(label)
@@ -133,7 +143,11 @@ def without_doubles(labels: Iterable[Keypoints]) -> list[Keypoints]:
             continue
         ordered = sorted(group, key=lambda label: -label.score)
         boxes = np.stack([label.box_xyxy for label in ordered])
-        kept += [ordered[i] for i in suppress_overlaps(boxes, np.zeros(len(boxes)), _COVERED_IOU)]
+        behind = np.triu(inside(boxes, boxes), 1).max(axis=0) >= _HALF_COVERED
+        kept += [
+            ordered[i] for i in suppress_overlaps(boxes, np.zeros(len(boxes)), _COVERED_IOU)
+            if not behind[i] or ordered[i].score >= doubts.get(category, 0.0)
+        ]  # fmt: skip
     return sorted(kept, key=lambda label: (label.frame, label.track_id))
 
 
@@ -187,12 +201,16 @@ class _Channel:
         self.labels: list[Keypoints] = []
         self.looks = 0
         self.sure_scores = {category: settings.sure_share * score for category, score in look.sure_scores.items()}
-        begin, self.plain_scores = (
-            {category: share * score for category, score in self.sure_scores.items()}
-            for share in (_BEGIN_SHARE, _PLAIN_SHARE)
-        )
-        self._tracker = RunTracker(start_scores=begin)
+        self._tracker = RunTracker(start_scores=self._scores(_BEGIN_SHARE))
         self._forget()
+
+    @property
+    def doubts(self) -> Mapping[str, float]:
+        """By category, the score below which a label needs room of its own."""
+        return self._scores(_DOUBT_SHARE) if self.look.decided else {}
+
+    def _scores(self, share: float) -> dict[str, float]:
+        return {category: share * score for category, score in self.sure_scores.items()}
 
     def _forget(self) -> None:
         flows = self.look.carries and self.settings.flow_step > 0
@@ -238,7 +256,7 @@ class _Channel:
         )
         self._labels = [label for label in self._labels if label.track_id in believed]
         found = self._labels + reach_back(self._looks, believed)
-        self.labels += trim_doubt(found, least_scores=self.plain_scores) if self.look.decided else found
+        self.labels += trim_doubt(found, least_scores=self._scores(_PLAIN_SHARE)) if self.look.decided else found
 
     def _look(self, views: _Views, number: int) -> None:
         if self._between.arriving(number):

@@ -140,6 +140,17 @@ def test_no_label_is_covered_by_a_better_one_of_its_kind() -> None:
     assert [(label.frame, label.track_id) for label in kept] == [(3, 0), (3, 2), (3, 3), (3, 4), (4, 1)]
 
 
+@pytest.mark.parametrize(("score", "shift", "kept"), [(0.79, 47, False), (0.79, 50, True), (0.81, 47, True)])
+def test_what_is_doubtful_needs_room_of_its_own(score: float, shift: int, kept: bool) -> None:
+    """Shifted by 47 of 96 parts of the width, the lesser is 0.51 covered; by 50, 0.48."""
+    first = replace(MovingCard().label(3), track_id=0)
+    width = float(first.box_xyxy[2] - first.box_xyxy[0])
+    moved = first.box_xyxy + np.array([shift * width / 96, 0, shift * width / 96, 0], np.float32)
+    other = replace(first, track_id=1, score=score, box_xyxy=moved)
+    assert len(without_doubles([first, other], doubts={"car": 0.8})) == 1 + kept
+    assert len(without_doubles([first, other])) == 2
+
+
 def test_what_a_coder_changes_is_the_same_picture_and_noise_is_not() -> None:
     picture = MovingCard().render(3)
     rng = np.random.default_rng(0)
