@@ -92,7 +92,7 @@ class BetweenLooks:
             path, end = self._paths[label.track_id], now.get(label.track_id)
             if end is None:
                 # Flow that lost it saw what now stands before it: there is nothing to show any more.
-                last = min(frame - 1, label.frame + self._shown, self._held[label.track_id])
+                last = min(frame - 1, label.frame + self.shown, self._held[label.track_id])
                 labels += [step for step in along_path(path) if step.frame <= last]
             elif len(path) > 1 and path[-1].frame == frame:
                 misses.append(_miss(path[-1], end))
@@ -103,8 +103,20 @@ class BetweenLooks:
         labels += self._came_from([label for label in seen if label.track_id not in known], frame)
         return self._inside(labels), float(np.median(misses)) if misses else 0.0
 
+    def run_out(self, grey: np.ndarray, *, frame: int) -> list[Keypoints] | None:
+        """The labels up to a run's last frame, or None where flow cannot take everything there: it must be looked at.
+
+        Args:
+            grey: ``small_grey`` of the last frame.
+            frame: its number.
+        """
+        if not self._trail or (self._trail[-1][1] < frame and not self.carry(grey, frame=frame)):
+            return None
+        return self.close((), frame=frame + 1)[0]
+
     @property
-    def _shown(self) -> int:
+    def shown(self) -> int:
+        """Frames after the last look for which something is shown that no later one confirms."""
         return min(self.shown_frames, UNSEEN_FRAMES)
 
     @property
@@ -120,7 +132,7 @@ class BetweenLooks:
         paths = [[label] for label in new]
         alive = list(paths)
         for (earlier, number), (later, _) in zip(self._trail[-2:0:-1], self._trail[:1:-1], strict=True):
-            if number < frame - self._shown or not alive:
+            if number < frame - self.shown or not alive:
                 break
             carried = carry(later, earlier, [path[0] for path in alive], frame=number)
             for path, moved in zip(alive, carried, strict=True):

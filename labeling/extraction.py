@@ -247,9 +247,9 @@ class _Channel:
             self._look(views, number)
 
     def finish(self) -> None:
-        """The run, or what came before a cut, ends: its last frame is looked at, so that nothing carried stays open,
-        and what is known by then is found in earlier looks."""
-        if self._latest and self._latest[1] != self._between.frame:
+        """The run, or what came before a cut, ends: its last frame is looked at unless the last look was just before,
+        so that nothing carried stays open, and what is known by then is found in earlier looks."""
+        if self._latest and self._latest[1] != self._between.frame and not self._run_out(*self._latest):
             self._look(*self._latest)
         believed = believed_tracks(
             self._looks, min_looks=_MIN_LOOKS, sure_looks=self.settings.sure_looks, sure_scores=self.sure_scores
@@ -257,6 +257,14 @@ class _Channel:
         self._labels = [label for label in self._labels if label.track_id in believed]
         found = self._labels + reach_back(self._looks, believed)
         self.labels += trim_doubt(found, least_scores=self._scores(_PLAIN_SHARE)) if self.look.decided else found
+
+    def _run_out(self, views: _Views, number: int) -> bool:
+        """Whether flow takes what the last look saw to the run's end."""
+        if self._clock - self._looked_at > self._between.shown:
+            return False
+        labels = self._between.run_out(views.grey, frame=number)
+        self._labels += labels or []
+        return labels is not None
 
     def _look(self, views: _Views, number: int) -> None:
         if self._between.arriving(number):

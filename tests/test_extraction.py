@@ -52,10 +52,30 @@ def test_nothing_is_shown_long_after_it_was_seen() -> None:
     assert all(label.points[23, 2] > 0 for label in labels)
 
 
-def test_the_last_frame_is_looked_at() -> None:
-    scene = MovingCard()
-    label_with([scene], (scene.render(t) for t in range(38)), first_frame=0, effort="fast")
-    assert scene.seen[-1] == 37
+@pytest.mark.parametrize(("effort", "after"), [("fast", 6), ("balanced", 2), ("exact", 0)])
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_run_ends_with_a_look_or_just_after_one(effort: Effort, after: int, every: int) -> None:
+    """What the last look saw is carried to the end where that is no further than it may be shown without another."""
+    ends = set()
+    for length in range(24, 38):
+        scene = MovingCard(speed=1.7)
+        frames = (scene.render(t - t % every) for t in range(length))
+        labels = label_with([scene], frames, first_frame=0, effort=effort)
+        assert [label.frame for label in labels] == list(range(length))
+        last = (length - 1) // every * every
+        ends.add(last - scene.seen[-1])
+        errors = np.linalg.norm(labels[-1].points[:, :2] - scene.truth(last), axis=1)
+        assert errors.max() < 2.0
+    assert max(ends) <= after and (every == 2 or max(ends) == after)
+
+
+def test_what_flow_cannot_take_to_the_end_is_looked_at() -> None:
+    ends = {}
+    for gone in (25, 26):
+        scene = MovingCard(speed=1.7, shown=range(gone))
+        label_with([scene], (scene.render(t) for t in range(26)), first_frame=0, effort="fast")
+        ends[gone] = scene.seen[-1]
+    assert ends == {25: 25, 26: 20}
 
 
 @pytest.mark.parametrize(("effort", "sure", "shown"), [("fast", 0.91, 40), ("exact", 0.91, 0), ("fast", 1.6, 0)])
