@@ -259,8 +259,10 @@ class _Channel:
         self.labels += trim_doubt(found, least_scores=self._scores(_PLAIN_SHARE)) if self.look.decided else found
 
     def _run_out(self, views: _Views, number: int) -> bool:
-        """Whether flow takes what the last look saw to the run's end."""
-        if self._clock - self._looked_at > self._between.shown:
+        """Whether flow takes what the last look saw to the run's end. Who was seen in no look before needs another."""
+        before = {label.track_id for look in self._looks[-2:-1] for label in look.labels}
+        new = any(label.track_id not in before for label in self._between.seen)
+        if new or self._clock - self._looked_at > self._between.shown:
             return False
         labels = self._between.run_out(views.grey, frame=number)
         self._labels += labels or []

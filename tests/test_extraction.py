@@ -69,6 +69,17 @@ def test_a_run_ends_with_a_look_or_just_after_one(effort: Effort, after: int, ev
     assert max(ends) <= after and (every == 2 or max(ends) == after)
 
 
+@pytest.mark.parametrize("first", [0, 24])
+def test_who_has_just_come_is_looked_at_again_at_the_end(first: int) -> None:
+    """A run of few frames, or of few frames after somebody came: one look alone is not believed."""
+    for frames in range(2, 8):
+        scene = MovingCard(speed=1.0, shown=range(first, 99))
+        labels = label_with([scene], (scene.render(t) for t in range(first + frames)), first_frame=0, effort="fast")
+        looks = [number for number in scene.seen if number >= first]
+        if looks and looks[0] < first + frames - 1:
+            assert len(looks) >= 2 and labels[-1].frame == first + frames - 1
+
+
 def test_what_flow_cannot_take_to_the_end_is_looked_at() -> None:
     ends = {}
     for gone in (25, 26):
