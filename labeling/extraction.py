@@ -207,7 +207,10 @@ class _Channel:
     @property
     def doubts(self) -> Mapping[str, float]:
         """By category, the score below which a label needs room of its own."""
-        return self._scores(_DOUBT_SHARE) if self.look.decided else {}
+        return self._decided(_DOUBT_SHARE)
+
+    def _decided(self, share: float) -> dict[str, float]:
+        return {category: score for category, score in self._scores(share).items() if category in self.look.decided}
 
     def _scores(self, share: float) -> dict[str, float]:
         return {category: share * score for category, score in self.sure_scores.items()}
@@ -256,7 +259,7 @@ class _Channel:
         )
         self._labels = [label for label in self._labels if label.track_id in believed]
         found = self._labels + reach_back(self._looks, believed)
-        self.labels += trim_doubt(found, least_scores=self._scores(_PLAIN_SHARE)) if self.look.decided else found
+        self.labels += trim_doubt(found, least_scores=self._decided(_PLAIN_SHARE))
 
     def _run_out(self, views: _Views, number: int) -> bool:
         """Whether flow takes what the last look saw to the run's end. Who was seen in no look before needs another."""

@@ -105,9 +105,9 @@ class YoloxCard(ModelCard, frozen=True):
     """Class name to a threshold of its own, in place of ``score_threshold``."""
     sure_scores: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=dict)
     """Class name to the score from which an object is surely there; 0.5 where nothing is said."""
-    decided_scores: bool = False
-    """Whether what is plainly seen scores near 1, so that what comes into view, or leaves it, is shown while it scores
-    nearly so. Most detectors are never sure of what is far."""
+    decided_classes: tuple[str, ...] = ()
+    """Classes of which what is plainly seen scores near 1, so that what comes into view, or leaves it, is shown while
+    it scores nearly so. Most detectors are never sure of what is far."""
     nms_threshold: float = Field(default=0.45, gt=0, le=1)
     """Overlap with a better box of its class above which a box goes."""
     soft_nms: SoftSuppression | None = None
@@ -117,11 +117,12 @@ class YoloxCard(ModelCard, frozen=True):
 
     @model_validator(mode="after")
     def _consistent(self) -> "YoloxCard":
-        unknown = {*self.categories, *self.score_thresholds, *self.sure_scores} - set(self.class_names)
+        named = {*self.categories, *self.score_thresholds, *self.sure_scores, *self.decided_classes}
+        unknown = named - set(self.class_names)
         if unknown:
             raise ValueError(
-                "categories, score_thresholds or sure_scores name classes that the model does not have: "
-                f"{sorted(unknown)}"
+                "categories, score_thresholds, sure_scores or decided_classes name classes that the model does not "
+                f"have: {sorted(unknown)}"
             )
         if self.input_width % 32 or self.input_height % 32:
             raise ValueError(f"a yolox input must be a multiple of 32, got {self.input_width}x{self.input_height}")
@@ -144,6 +145,12 @@ class YoloxCard(ModelCard, frozen=True):
         for name, category in self.categories.items():
             scores[category] = min(scores.get(category, 1.0), self.sure_scores.get(name, DEFAULT_SURE_SCORE))
         return scores
+
+    @property
+    def decided_categories(self) -> frozenset[str]:
+        """Categories all of whose classes have decided scores."""
+        doubtful = {category for name, category in self.categories.items() if name not in self.decided_classes}
+        return frozenset(self.categories.values()) - doubtful
 
     def output_shapes(self) -> dict[str, Dimensions]:
         """One output: a row of box, objectness and class scores per grid cell."""

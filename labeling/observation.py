@@ -1,6 +1,6 @@
 """What the networks see in one frame: detection with keypoint heads, and bottom-up fields."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -26,8 +26,8 @@ class Look(Protocol):
     """Whether the points it gives lie on things that optical flow can follow."""
     sure_scores: Mapping[str, float]
     """Objects of each category that score at least this are surely there; a category that is not named has no doubt."""
-    decided: bool
-    """Whether what it sees plainly scores near 1: what does not is hardly in view."""
+    decided: Collection[str]
+    """Categories of which what is plainly seen scores near 1: what does not is hardly in view."""
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """Untracked labels of an (H, W, 3) uint8 RGB frame, numbered ``number``."""
@@ -66,7 +66,7 @@ class ObjectLook:
         assert extractors.detector is not None
         self.extractors, self.categories = extractors, categories
         self.sure_scores: Mapping[str, float] = extractors.detector.card.category_sure_scores
-        self.decided = extractors.detector.card.decided_scores
+        self.decided: Collection[str] = extractors.detector.card.decided_categories
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         """As ``Look.see``."""
@@ -99,7 +99,7 @@ class ObjectLook:
 class FieldLook:
     """Objects of a bottom-up network."""
 
-    decided = False
+    decided: Collection[str] = ()
 
     def __init__(self, model: FieldModel, categories: Sequence[Category]) -> None:
         self.model, self.categories = model, categories

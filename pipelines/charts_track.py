@@ -5,7 +5,7 @@ only what makes tracks of them is timed and judged.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -56,7 +56,7 @@ class TrackClip:
     looks: tuple[tuple[Keypoints, ...], ...]
     sure_scores: Mapping[str, float]
     """Of the detector that looked."""
-    decided: bool
+    decided: Collection[str]
     """As ``Look.decided``."""
 
     def look(self) -> Look:
@@ -70,7 +70,7 @@ class Remembered:
     carries = True
 
     def __init__(
-        self, looks: Sequence[Sequence[Keypoints]], sure_scores: Mapping[str, float], *, decided: bool
+        self, looks: Sequence[Sequence[Keypoints]], sure_scores: Mapping[str, float], *, decided: Collection[str]
     ) -> None:
         self.looks, self.sure_scores, self.decided = looks, sure_scores, decided
 

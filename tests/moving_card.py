@@ -1,6 +1,6 @@
 """A textured card that moves over a textured wall and knows where its points are: a scene for what carries points."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ class MovingCard:
 
     carries = True
     sure_scores: Mapping[str, float] = {"car": 0.5}
-    decided: bool = False
+    decided: Collection[str] = ()
 
     def __init__(
         self, *, speed: float = 2.0, growth: float = 0.0, cut: int | None = None, shown: range = range(999)

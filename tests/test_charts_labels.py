@@ -21,7 +21,7 @@ def seen_as_it_is() -> TrackClip:
     """A street whose looks are the truth."""
     clip = street_frames("crossing", HELD_OUT_SEED + 3, 16, width=352, height=234)
     looks = tuple(tuple(one for one in labels if one.category != "lane") for labels in clip.labels)
-    return TrackClip(clip=clip, looks=looks, sure_scores={"car": 0.5, "person": 0.5}, decided=False)
+    return TrackClip(clip=clip, looks=looks, sure_scores={"car": 0.5, "person": 0.5}, decided=())
 
 
 def test_trackers_on_the_truth(seen_as_it_is: TrackClip) -> None:

@@ -97,7 +97,7 @@ def test_a_class_may_have_a_threshold_of_its_own() -> None:
     boxes = [(10, 10, 50, 50, 0, 0.35), (70, 10, 90, 60, 2, 0.2), (100, 10, 130, 60, 3, 0.35)]
     found = detect(boxes, score_thresholds={"car": 0.4, "person": 0.15})
     assert found.classes.tolist() == ["dog", "person"]
-    with pytest.raises(ValueError, match="sure_scores name classes"):
+    with pytest.raises(ValueError, match="decided_classes name classes"):
         toy_card(score_thresholds={"horse": 0.4})
 
 
@@ -109,6 +109,14 @@ def test_a_class_may_have_a_threshold_of_its_own() -> None:
 )  # fmt: skip
 def test_a_category_is_as_sure_as_its_most_trusted_class(told: dict[str, float], car: float, person: float) -> None:
     assert toy_card(sure_scores=told).category_sure_scores == {"car": car, "person": person}
+
+
+def test_a_category_is_decided_where_all_its_classes_are() -> None:
+    assert toy_card().decided_categories == frozenset()
+    assert toy_card(decided_classes=["car"]).decided_categories == frozenset()
+    assert toy_card(decided_classes=["car", "truck"]).decided_categories == {"car"}
+    with pytest.raises(ValueError, match="decided_classes name classes"):
+        toy_card(decided_classes=["horse"])
 
 
 def test_an_empty_frame_has_no_detections() -> None:

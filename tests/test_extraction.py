@@ -1,6 +1,6 @@
 """How often the networks look, and what is carried in between: on moving textures whose points are known."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,7 +105,8 @@ class Scored(MovingCard):
 
     def __init__(self, scores: Sequence[float], *, decided: bool) -> None:
         super().__init__()
-        self.scores, self.decided = scores, decided
+        self.scores = scores
+        self.decided: Collection[str] = ("car",) if decided else ("person",)
 
     def see(self, frame: np.ndarray, number: int) -> list[Keypoints]:
         return [replace(label, score=self.scores[number]) for label in super().see(frame, number)]

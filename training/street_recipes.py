@@ -173,7 +173,7 @@ def _detector_recipe(settings: FitSettings, again: FitSettings, enlarge: int) ->
         name=settings.name, file=f"{settings.name}.onnx", licence=_LICENCE, source=_DETECTOR_SOURCE, classes=CLASSES,
         categories={name: name for name in CLASSES}, input_width=PICTURE_SIZE[0], input_height=PICTURE_SIZE[1],
         # The second look leaves one box of each object.
-        score_threshold=0.4, nms_threshold=1.0, max_detections=OBJECTS, decided_scores=True,
+        score_threshold=0.4, nms_threshold=1.0, max_detections=OBJECTS, decided_classes=CLASSES,
     )  # fmt: skip
     first = Lesson(
         batches=lambda pool: DetectorBatches(pool=pool, sizes=sizes, augment=AugmentSettings()), fit=settings,
