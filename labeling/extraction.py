@@ -143,10 +143,10 @@ def without_doubles(labels: Iterable[Keypoints], *, doubts: Mapping[str, float] 
             continue
         ordered = sorted(group, key=lambda label: -label.score)
         boxes = np.stack([label.box_xyxy for label in ordered])
-        behind = np.triu(inside(boxes, boxes), 1).max(axis=0) >= _HALF_COVERED
         kept += [
             ordered[i] for i in suppress_overlaps(boxes, np.zeros(len(boxes)), _COVERED_IOU)
-            if not behind[i] or ordered[i].score >= doubts.get(category, 0.0)
+            if i == 0 or ordered[i].score >= doubts.get(category, 0.0)
+            or inside(boxes[:i], boxes[i : i + 1]).max() < _HALF_COVERED
         ]  # fmt: skip
     return sorted(kept, key=lambda label: (label.frame, label.track_id))
 

@@ -111,7 +111,7 @@ def _against_truth(
     else:
         drop = 100 * pooled_pck(clean) - share
         first = judged(name, drop, unit="points of PCK lost", at_most=lost, method=effort, note=note)
-    haunted = f"{sum(bool(frame.phantoms) for frame in frames)} of {len(frames)}"
+    haunted = f"{ghosts * len(frames) / 100:.0f} of {len(frames)}"
     return [
         first,
         judged(name, ghosts, unit="% of frames with a phantom", at_most=phantoms, method=effort, note=haunted),
