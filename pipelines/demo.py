@@ -26,7 +26,7 @@ from labeling.errors import DataError
 from labeling.video import read_frames
 from pipelines.commands import JobOptions, run_label
 from pipelines.console import duration, make_console
-from pipelines.engine import starting_workers
+from pipelines.engine import minding_workers
 from pipelines.report import (
     PageTable,
     Picture,
@@ -116,6 +116,7 @@ def write_streets(folder: Path, *, workers: int | None = None) -> list[Path]:
 
     Raises:
         StorageError: the folder cannot be written to.
+        ConfigError: a worker died.
     """
     make_folder(folder)
     paths = {video_id: folder / f"{video_id}.mp4" for video_id in _STREETS}
@@ -127,7 +128,7 @@ def write_streets(folder: Path, *, workers: int | None = None) -> list[Path]:
             _write_street(video_id, path)
     else:
         context = multiprocessing.get_context("spawn")
-        with starting_workers(), ProcessPoolExecutor(max_workers=workers, mp_context=context) as pool:
+        with minding_workers(), ProcessPoolExecutor(max_workers=workers, mp_context=context) as pool:
             list(pool.map(_write_street, *zip(*missing, strict=True)))
     return list(paths.values())
 

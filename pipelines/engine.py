@@ -10,6 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -30,17 +31,21 @@ _DEATHS_ALLOWED = 2
 
 
 @contextlib.contextmanager
-def starting_workers() -> Iterator[None]:
-    """Say it where processes cannot start: a broken pipe is else taken for a reader of the output who has left.
+def minding_workers() -> Iterator[None]:
+    """Say it where processes cannot start, or a pool's die: it is no fault of the code, and no reader who has left.
 
     Raises:
-        ConfigError: a process ended while it was being started.
+        ConfigError: a process ended while it was being started, or one of a pool's died.
     """
     try:
         yield
     except BrokenPipeError as error:
         raise ConfigError(
             "a worker ended while it was being started, for lack of memory most likely; give fewer --workers"
+        ) from error
+    except BrokenProcessPool as error:
+        raise ConfigError(
+            "a worker died, of lack of memory most likely; give fewer --workers: what is done is kept"
         ) from error
 
 
@@ -158,7 +163,7 @@ class _Worker:
         self.connection, other = context.Pipe()
         self.process = context.Process(target=_serve, args=(root, other, os.getpid()), daemon=True)
         self.task: Task | None = None
-        with _one_thread_each(), starting_workers():
+        with _one_thread_each(), minding_workers():
             self.process.start()
         other.close()
 

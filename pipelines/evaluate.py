@@ -9,7 +9,6 @@ import functools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -19,9 +18,8 @@ import numpy as np
 from dataset.loader import Sample, ShardDataset
 from dataset.receipts import atomic_write, digest, make_folder, sha256_file, storage_errors, try_folder
 from labeling.camera import read_tum, resample
-from labeling.errors import ConfigError
 from labeling.extractors import Extractors, choose_extractors
-from pipelines.engine import starting_workers
+from pipelines.engine import minding_workers
 from pipelines.evaluate_notes import clip_notes, record_notes, result_notes, ruler_notes
 from pipelines.evaluate_ruler import EvaluateOptions, Ruler, check_options, read_ruler
 from training.evaluation import ClipTruth, SampleEstimate, score_clip, too_short, with_fault
@@ -159,15 +157,10 @@ def _worked(tasks: Mapping[str, _Task], *, workers: int) -> Iterator[tuple[str, 
     if min(workers, len(tasks)) < 2:
         yield from ((stamp, _evaluate_clip(task)) for stamp, task in list(tasks.items()))
         return
-    with starting_workers(), ProcessPoolExecutor(min(workers, len(tasks)), mp_context=get_context("spawn")) as pool:
+    with minding_workers(), ProcessPoolExecutor(min(workers, len(tasks)), mp_context=get_context("spawn")) as pool:
         running = {pool.submit(_evaluate_clip, task): stamp for stamp, task in tasks.items()}
-        try:
-            for done in as_completed(running):
-                yield running[done], done.result()
-        except BrokenProcessPool as error:
-            raise ConfigError(
-                "a worker died, of lack of memory most likely; give fewer --workers: what is done is kept"
-            ) from error
+        for done in as_completed(running):
+            yield running[done], done.result()
 
 
 @functools.lru_cache(maxsize=1)

@@ -6,14 +6,16 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
 
 from dataset.receipts import ReceiptLog, read_receipts
-from labeling.errors import VideoError
+from labeling.errors import ConfigError, VideoError
 from pipelines import stage as stage_module
-from pipelines.engine import Engine
+from pipelines.engine import Engine, minding_workers
 from pipelines.items import Task, perform, sweep_staging
 from pipelines.stage import DroppedError, WorkItem, item_state
 
@@ -178,7 +180,7 @@ def _fields(receipt):
 def test_workers_die_with_their_parent(tmp_path):
     code = (
         "import sys; from pathlib import Path\n"
-        "from pipelines.engine import Engine; from test_engine import Task, item\n"
+        "from pipelines.engine import Engine, minding_workers; from test_engine import Task, item\n"
         "if __name__ == '__main__':\n"
         "    with Engine(Path(sys.argv[1]), workers=1) as engine:\n"
         "        list(engine.run([Task(item=item('a', do='slow'))]))\n"
@@ -225,3 +227,12 @@ def test_staging_of_a_process_that_lives_is_left_alone(tmp_path):
         folder.mkdir(parents=True)
     sweep_staging(tmp_path)
     assert mine.is_dir() and other.is_dir()
+
+
+def test_a_killed_worker_of_a_pool_is_an_error_that_advises() -> None:
+    context = get_context("spawn")
+    with (
+        pytest.raises(ConfigError, match="a worker died.*fewer --workers.*what is done is kept"),
+        minding_workers(), ProcessPoolExecutor(1, mp_context=context) as pool,
+    ):  # fmt: skip
+        list(pool.map(signal.raise_signal, [signal.SIGKILL]))
