@@ -6,7 +6,6 @@ from the last look to the first, in which only believed tracks begin and what no
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -59,6 +58,6 @@ def _of_category(looks: Sequence[TrackedLook], believed: frozenset[int], categor
                 # Who changes hands takes the name along: no two backward tracks reach back for one.
                 names = {i: name for i, name in names.items() if name != label.track_id} | {backward: label.track_id}
             elif backward != UNTRACKED and backward in names and names[backward] not in taken:
-                found.append(replace(label, track_id=names[backward]))
+                found.append(label.renumbered(track_id=names[backward]))
         later = look
     return found

@@ -5,8 +5,9 @@ so that small and fast ones still meet their predictions (Yang et al. 2023, C-BI
 camera's own turn taken out of the prediction where it is known. What goes behind something goes on as it went before.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -75,11 +76,15 @@ class BoxTracker:
 
     The state is four independent constant-velocity Kalman filters (centre and log size), so that a box that grows as it
     comes nearer keeps its rate of growth.
+
+    Args:
+        settings: when a box belongs to a track.
+        ids: where new tracks get theirs; from 0 by default.
     """
 
-    def __init__(self, settings: TrackerSettings | None = None, *, first_id: int = 0) -> None:
+    def __init__(self, settings: TrackerSettings | None = None, *, ids: Iterator[int] | None = None) -> None:
         self.settings = settings or TrackerSettings()
-        self.next_id = first_id
+        self._ids = count() if ids is None else ids
         self._tracks: list[_Track] = []
 
     @property
@@ -171,11 +176,10 @@ class BoxTracker:
         covariance[:, 0, 0], covariance[:, 1, 1] = spread**2, spread**2
         self._tracks.append(
             _Track(
-                track_id=self.next_id, mean=mean, covariance=covariance, past=_sighting(box_xyxy), lost_frames=0
+                track_id=next(self._ids), mean=mean, covariance=covariance, past=_sighting(box_xyxy), lost_frames=0
             )
         )  # fmt: skip
-        self.next_id += 1
-        return self.next_id - 1
+        return self._tracks[-1].track_id
 
 
 def _turned_back(track: _Track, boxes_xyxy: np.ndarray, *, lost: bool) -> np.ndarray:

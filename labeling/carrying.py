@@ -35,7 +35,7 @@ UNSEEN_FRAMES = 6
 
 _FEW, _MANY = (
     np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
-    for places in (np.linspace(0.25, 0.75, 3), np.linspace(0.2, 0.8, 4))
+    for places in (np.linspace(0.3, 0.7, 2), np.linspace(0.2, 0.8, 4))
 )
 
 

@@ -10,9 +10,9 @@ must last, and how long after its last sight it may be shown, go by time: they c
 of a picture that is shown for longer than is usual in its source.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import count
 
 import cv2
 import numpy as np
@@ -41,8 +41,8 @@ _BEGIN_SHARE, _PLAIN_SHARE, _DOUBT_SHARE = 0.9, 0.8, 0.95
 something is late. Where scores are decided, it is shown from one plain look to another; and what is not quite sure and
 half behind a better label of its kind is that one's double, or hardly in view."""
 _HALF_COVERED = 0.5
-_SAMPLE, _SAME_LEVELS = 16, 2
-"""Every so many pixels are compared before all are; and by how many levels they may differ."""
+_SAMPLE_ROWS, _SAME_LEVELS = 64, 2
+"""One row in so many is compared before all are; and by how many levels pixels may differ."""
 _PACE_MOMENTS = 9
 """So many moments tell how fast the source runs: a camera that froze is none of fewer frames."""
 _TURN_STEP = 4
@@ -86,7 +86,8 @@ def label_with(
 ) -> list[Keypoints]:
     """As ``label_frames``, for anything that looks at a frame and tells what it sees."""
     settings = effort if isinstance(effort, EffortSettings) else EFFORTS[effort]
-    channels = [_Channel(look, settings) for look in looks]
+    ids = count()
+    channels = [_Channel(look, settings, ids=ids) for look in looks]
     moments: list[int] = []
     shown: list[int] = []
     clocks: list[int] = []
@@ -101,7 +102,7 @@ def label_with(
         shown.append(len(moments) - 1)
     for channel in channels:
         channel.finish()
-    labels = _renumbered([channel.labels for channel in channels])
+    labels = [label for channel in channels for label in channel.labels]
     fresh = frozenset(moment for moment, number in enumerate(moments) if number in breaks)
     windows = SmoothingSettings().at_pace(_pace(moments))
     smooth = smooth_tracks(labels, settings=windows, breaks=fresh)
@@ -110,7 +111,7 @@ def label_with(
     labels = _on_grid(labels, shown, first_frame=first_frame)
     last = first_frame + len(shown) - 1
     ends = {first_frame, last, *breaks, *(number - 1 for number in breaks)}
-    return _renumbered([drop_brief_tracks(labels, min_frames=_MIN_FRAMES, open_at=ends)])
+    return _counted_from_0(drop_brief_tracks(labels, min_frames=_MIN_FRAMES, open_at=ends))
 
 
 def _pace(moments: Sequence[int]) -> int:
@@ -158,7 +159,7 @@ def same_picture(picture: np.ndarray, other: np.ndarray) -> bool:
     """
     if picture.shape != other.shape:
         return False
-    few, others = (one[::_SAMPLE, ::_SAMPLE] for one in (picture, other))
+    few, others = (one[::_SAMPLE_ROWS] for one in (picture, other))
     if cv2.norm(np.ascontiguousarray(few), np.ascontiguousarray(others), cv2.NORM_INF) > _SAME_LEVELS:
         return False
     return cv2.norm(picture, other, cv2.NORM_INF) <= _SAME_LEVELS
@@ -170,7 +171,7 @@ def _on_grid(labels: Sequence[Keypoints], shown: Sequence[int], *, first_frame: 
     for label in labels:
         by_moment.setdefault(label.frame, []).append(label)
     return [
-        label if label.frame == number else replace(label, frame=number)
+        label if label.frame == number else label.renumbered(frame=number)
         for number, moment in enumerate(shown, start=first_frame)
         for label in by_moment.get(moment, [])
     ]
@@ -196,12 +197,12 @@ class _Views:
 class _Channel:
     """One kind of look (objects, or a bottom-up network's) with its own rhythm, tracks and carried points."""
 
-    def __init__(self, look: Look, settings: EffortSettings) -> None:
+    def __init__(self, look: Look, settings: EffortSettings, *, ids: Iterator[int]) -> None:
         self.look, self.settings = look, settings
         self.labels: list[Keypoints] = []
         self.looks = 0
         self.sure_scores = {category: settings.sure_share * score for category, score in look.sure_scores.items()}
-        self._tracker = RunTracker(start_scores=self._scores(_BEGIN_SHARE))
+        self._tracker = RunTracker(start_scores=self._scores(_BEGIN_SHARE), ids=ids)
         self._forget()
 
     @property
@@ -275,7 +276,7 @@ class _Channel:
         if self._between.arriving(number):
             self._between.carry(views.grey, frame=number)
         self._turn(views, number)
-        seen = [replace(label, frame=number) for label in self.look.see(views.frame, views.number)]
+        seen = [label.renumbered(frame=number) for label in self.look.see(views.frame, views.number)]
         carried = self._between.carried(number)
         named = self._tracker.update(seen, frame=self._clock, previous_to_current=self._turned, carried=carried)
         self._looks.append(TrackedLook(frame=self._clock, labels=tuple(named), turn=self._turned))
@@ -302,15 +303,7 @@ class _Channel:
         self._far = (views.far, number)
 
 
-def _renumbered(channels: list[list[Keypoints]]) -> list[Keypoints]:
-    """All channels' labels by frame, with ids that count from 0 as objects appear."""
-    ordered = sorted(
-        ((label, index) for index, labels in enumerate(channels) for label in labels),
-        key=lambda pair: (pair[0].frame, pair[1], pair[0].track_id),
-    )
-    ids: dict[tuple[int, int], int] = {}
-    numbers = [ids.setdefault((i, label.track_id), len(ids)) for label, i in ordered]
-    return [
-        label if label.track_id == number else replace(label, track_id=number)
-        for (label, _), number in zip(ordered, numbers, strict=True)
-    ]
+def _counted_from_0(labels: Iterable[Keypoints]) -> list[Keypoints]:
+    """Labels with ids that count from 0 as objects appear."""
+    numbers: dict[int, int] = {}
+    return [label.renumbered(track_id=numbers.setdefault(label.track_id, len(numbers))) for label in labels]

@@ -4,7 +4,7 @@ Keypoints are the truth; skeleton, object and caption are views of them.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -52,7 +52,22 @@ class Keypoints:
         if not math.isfinite(float(self.points.sum(dtype=np.float64)) + float(self.box_xyxy.sum()) + self.score):
             raise DataError(f"frame {self.frame}: a {self.category} has coordinates or scores that are not finite")
 
+    def renumbered(self, *, frame: int | None = None, track_id: int | None = None) -> "Keypoints":
+        """The same sighting under another frame or track. What was checked once is not checked again: a run's labels
+        are renumbered several times each."""
+        twin = object.__new__(Keypoints)
+        for name in _FIELDS:
+            object.__setattr__(twin, name, getattr(self, name))
+        if frame is not None:
+            object.__setattr__(twin, "frame", frame)
+        if track_id is not None:
+            object.__setattr__(twin, "track_id", track_id)
+        return twin
+
     @property
     def present(self) -> np.ndarray:
         """(K,) bool: the points that were seen."""
         return self.points[:, 2] > 0
+
+
+_FIELDS = tuple(field.name for field in fields(Keypoints))

@@ -1,6 +1,7 @@
 """Which lane line of this frame is which of the last: lines are compared where both reach."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import count
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -13,10 +14,18 @@ _ROW_WEIGHTS = np.linspace(0.5, 1.5, 12) / 12
 
 
 class LaneTracker:
-    """Ids for lane lines: the nearest line of the last frames, compared where both reach, bottom weighted most."""
+    """Ids for lane lines: the nearest line of the last frames, compared where both reach, bottom weighted most.
 
-    def __init__(self, *, first_id: int = 0, max_distance_px: float = 60.0, max_lost_frames: int = 24) -> None:
-        self.next_id = first_id
+    Args:
+        ids: where new lines get theirs; from 0 by default.
+        max_distance_px: between a line and itself in the next frame.
+        max_lost_frames: for so long a line that is not seen is remembered.
+    """
+
+    def __init__(
+        self, *, ids: Iterator[int] | None = None, max_distance_px: float = 60.0, max_lost_frames: int = 24
+    ) -> None:
+        self._ids = count() if ids is None else ids
         self.max_distance_px, self.max_lost_frames = max_distance_px, max_lost_frames
         self._lines: dict[int, tuple[np.ndarray, int]] = {}
 
@@ -44,8 +53,7 @@ class LaneTracker:
                 if cost[row, column] <= self.max_distance_px:
                     ids[column] = known[row]
         for column in np.flatnonzero(ids == UNTRACKED):
-            ids[column] = self.next_id
-            self.next_id += 1
+            ids[column] = next(self._ids)
         self._lines = {
             i: (line, age + frame_step)
             for i, (line, age) in self._lines.items()

@@ -114,14 +114,14 @@ def _smooth_track(group: list[Keypoints], settings: SmoothingSettings) -> list[K
     scores = np.interp(np.arange(length), rows, [label.score for label in group])
     source[filled] = POINT_INTERPOLATED
     points[..., :2] = smooth_series(points, settings)
-    corners[..., :2] = smooth_series(corners, settings)
+    boxes = smooth_series(corners, settings).reshape(length, 4).astype(np.float32)
+    points = points.astype(np.float32)
     return [
         replace(
-            group[0], frame=int(first + row), score=float(scores[row]),
-            box_xyxy=corners[row, :, :2].reshape(4).astype(np.float32),
-            points=points[row].astype(np.float32), point_source=source[row],
+            group[0], frame=first + row, score=float(scores[row]), box_xyxy=boxes[row], points=points[row],
+            point_source=source[row],
         )
-        for row in np.flatnonzero(corners[:, 0, 2] > 0)
+        for row in np.flatnonzero(corners[:, 0, 2] > 0).tolist()
     ]  # fmt: skip
 
 

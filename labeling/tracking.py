@@ -1,8 +1,9 @@
 """Track ids of a run: every category with its tracker, and what is too short to be believed."""
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 
@@ -28,14 +29,16 @@ class RunTracker:
     Args:
         settings: of every category.
         start_scores: a ``high_score`` of its own for each category, in place of the settings'.
+        ids: where new tracks get theirs, where others share them; from 0 by default.
     """
 
     def __init__(
-        self, settings: TrackerSettings | None = None, *, start_scores: Mapping[str, float] | None = None
-    ) -> None:
+        self, settings: TrackerSettings | None = None, *, start_scores: Mapping[str, float] | None = None,
+        ids: Iterator[int] | None = None,
+    ) -> None:  # fmt: skip
         self._settings, self._start_scores = settings or TrackerSettings(), dict(start_scores or {})
         self._trackers: dict[str, BoxTracker | LaneTracker] = {}
-        self._next_id = 0
+        self._ids = count() if ids is None else ids
         self._frame: int | None = None
 
     @property
@@ -70,17 +73,15 @@ class RunTracker:
             group = [label for label in labels if label.category == category]
             tracker = self._trackers.get(category) or self._new_tracker(category)
             self._trackers[category] = tracker
-            tracker.next_id = self._next_id
             ids = _update(tracker, group, step, previous_to_current, carried)
-            self._next_id = tracker.next_id
-            out += [replace(label, track_id=int(i)) for label, i in zip(group, ids, strict=True)]
+            out += [label.renumbered(track_id=int(i)) for label, i in zip(group, ids, strict=True)]
         return out
 
     def _new_tracker(self, category: str) -> "BoxTracker | LaneTracker":
         if category == "lane":
-            return LaneTracker()
+            return LaneTracker(ids=self._ids)
         least = self._start_scores.get(category, self._settings.high_score)
-        return BoxTracker(replace(self._settings, high_score=least))
+        return BoxTracker(replace(self._settings, high_score=least), ids=self._ids)
 
 
 def believed_tracks(

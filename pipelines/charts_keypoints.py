@@ -39,7 +39,8 @@ from pipelines.peers import RtmlibStreet
 from pipelines.track_errors import track_score
 
 SCENARIOS: tuple[Scenario, ...] = ("empty", "parked", "drive", "crossing", "traffic")
-_FRAMES = 72
+_FRAMES = 121
+"""As long as the clips that jobs cut: what a run's first look and its last cost weighs more in less."""
 _SEED = HELD_OUT_SEED + 100
 _DRAWS = 400
 _ALONE, _PEER = "every frame alone", "rtmlib (no lanes)"
@@ -88,11 +89,7 @@ def keypoint_clips(*, quick: bool = False) -> list[KeypointClip]:
     """The streets of the chart, from empty to dense traffic."""
     if quick:
         return [street_frames("crossing", _SEED, 13, width=WIDTH // 2, height=HEIGHT // 2)]
-    # An empty road is judged over a clip's five seconds: its first look and its last weigh more in less.
-    return [
-        street_frames(scenario, _SEED + n, 121 if scenario == "empty" else _FRAMES)
-        for n, scenario in enumerate(SCENARIOS)
-    ]
+    return [street_frames(scenario, _SEED + n, _FRAMES) for n, scenario in enumerate(SCENARIOS)]
 
 
 @contextmanager
