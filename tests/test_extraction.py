@@ -230,7 +230,9 @@ def test_what_a_coder_changes_is_the_same_picture_and_noise_is_not() -> None:
     rng = np.random.default_rng(0)
     coded = np.clip(picture + rng.integers(-2, 3, picture.shape), 0, 255).astype(np.uint8)
     noisy = np.clip(picture + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
-    moved = MovingCard().render(4)
+    moved, touched = MovingCard().render(4), picture.copy()
+    touched[70:80, 100:110] = 0
+    assert not same_picture(picture, touched), "a change between the rows that are compared first"
     assert same_picture(picture, picture.copy()) and same_picture(picture, coded)
     assert not same_picture(picture, noisy) and not same_picture(picture, moved)
     assert not same_picture(picture, picture[:-2])
@@ -362,6 +364,21 @@ def test_ids_count_from_0_whatever_was_dropped() -> None:
     labels = shown(ComesAndGoes([*range(10, 14), *range(70, 90)]))
     assert [label.frame for label in labels] == list(range(70, 90))
     assert {label.track_id for label in labels} == {0}
+
+
+class Lower(MovingCard):
+    def place(self, frame: int) -> tuple[float, np.ndarray]:
+        return 1.0, np.array([200.0 - 2 * frame, 150.0])
+
+
+def test_two_kinds_of_look_share_no_ids() -> None:
+    looks = [MovingCard(), Lower()]
+    labels = label_with(looks, (looks[0].render(t) for t in range(48)), first_frame=0, effort="exact")
+    for track_id, look in enumerate(looks):
+        own = [label for label in labels if label.track_id == track_id]
+        assert [label.frame for label in own] == list(range(48))
+        assert all(np.allclose(label.points[:, :2], look.truth(label.frame), atol=0.1) for label in own)
+    assert len(labels) == 96
 
 
 def test_who_is_there_at_a_runs_ends_need_not_last() -> None:

@@ -1,12 +1,13 @@
 """Keypoint schemas and the label record."""
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import pytest
 
 from labeling.errors import ConfigError, DataError
-from labeling.labels import Keypoints
+from labeling.labels import UNTRACKED, Keypoints
 from labeling.schemas import CATEGORIES, keypoint_schema
 
 COUNTS = {
@@ -50,6 +51,16 @@ def test_record_knows_its_present_points() -> None:
     points = np.zeros((24, 3), np.float32)
     points[5] = (3, 4, 0.5)
     assert record(points=points).present.nonzero()[0].tolist() == [5]
+
+
+def test_a_record_under_another_number_is_the_same_otherwise() -> None:
+    first = record(score=0.7)
+    for changes in ({"frame": 5}, {"track_id": 3}, {"frame": 0, "track_id": 0}):
+        twin = first.renumbered(**changes)
+        kept = {field.name for field in fields(first)} - set(changes)
+        assert {name: getattr(twin, name) for name in changes} == changes
+        assert all(getattr(twin, name) is getattr(first, name) for name in kept)
+    assert (first.frame, first.track_id) == (0, UNTRACKED)
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,8 @@ def _train_models(jobs: Sequence[_Job], pools: dict[PoolName, StreetPool], *, at
     with ProcessPoolExecutor(min(at_once, len(jobs)), mp_context=get_context("fork")) as processes:
         for name, seconds in processes.map(_train, jobs):
             print(f"{name} trained in {seconds:.0f} s", flush=True)
+    # Gigabytes, which judging needs for pictures of its own.
+    _shared_pools.clear()
 
 
 def _train(job: _Job) -> tuple[str, float]:
@@ -162,7 +164,6 @@ def write_figures(folder: Path, figures: dict[str, float], *, frames: int) -> No
 
 def train_all(options: argparse.Namespace) -> None:
     """Train those models that ``--only`` names and no checkpoint holds."""
-    budget = BUDGETS[options.device]
     jobs = [
         _Job(name=name, device=options.device, seed=options.seed, share=options.share, checkpoints=options.checkpoints)
         for name in options.only
@@ -172,13 +173,7 @@ def train_all(options: argparse.Namespace) -> None:
         # Counted without opening the GPU, which forked processes could not use then.
         if options.device == "cuda" and not torch.cuda.device_count():
             raise SystemExit("--device cuda: torch sees no GPU; leave it out, or name finished --checkpoints")
-        needed = {lesson.pool for job in missing for lesson in job.unfinished}
-        pools: dict[PoolName, StreetPool] = {}
-        if "first" in needed:
-            pools["first"] = _rendered(TRAIN_SEED, options.streets or budget.streets, options.workers)
-        if "others" in needed:
-            pools["others"] = _rendered(SECOND_LOOK_SEED, options.streets or budget.other_streets, options.workers)
-        _train_models(missing, pools, at_once=budget.jobs)
+        _train_models(missing, _needed_pools(missing, options), at_once=BUDGETS[options.device].jobs)
     if options.train_only:
         return
     for job in jobs:
@@ -189,6 +184,17 @@ def train_all(options: argparse.Namespace) -> None:
     streets = CHOOSING_STREETS * options.judged_streets // JUDGED_STREETS
     frames = list(judging_frames(VALIDATION_SEED, streets, JUDGED_FRAMES))
     choose_thresholds(options.out, options.only, frames)
+
+
+def _needed_pools(jobs: Sequence[_Job], options: argparse.Namespace) -> dict[PoolName, StreetPool]:
+    budget = BUDGETS[options.device]
+    needed = {lesson.pool for job in jobs for lesson in job.unfinished}
+    pools: dict[PoolName, StreetPool] = {}
+    if "first" in needed:
+        pools["first"] = _rendered(TRAIN_SEED, options.streets or budget.streets, options.workers)
+    if "others" in needed:
+        pools["others"] = _rendered(SECOND_LOOK_SEED, options.streets or budget.other_streets, options.workers)
+    return pools
 
 
 def _rendered(first_seed: int, streets: int, workers: int) -> StreetPool:
