@@ -71,7 +71,12 @@ def rtmlib_detector(card: YoloxCard, path: Path | None = None) -> Callable[[np.n
 
     size = (card.input_height, card.input_width)
     settings = {"det_mode": "multiclass", "nms_thr": card.nms_threshold, "score_thr": card.score_threshold}
-    return _one_thread(partial(YOLOX, model_input_size=size, **settings), card, path)
+    peer: Any = _one_thread(partial(YOLOX, model_input_size=size, **settings), card, path)
+    if card.mean != (0, 0, 0) or card.std != (1, 1, 1):
+        # It knows no normalisation for YOLOX.
+        mean, std, infer = np.array(card.mean, np.float32), np.array(card.std, np.float32), peer.inference
+        peer.inference = lambda picture: infer((picture - mean) / std)
+    return peer
 
 
 def _one_thread(open_peer: Callable[..., Any], card: ModelCard, path: Path | None = None) -> Callable[..., Any]:

@@ -206,7 +206,7 @@ def test_nights_have_lamps_and_headlights_and_nothing_else_is_lit() -> None:
 
 
 def field_batch_loss(network: torch.nn.Module, batch: Batch) -> torch.Tensor:
-    cif, caf = network(to_input(batch.pictures, "imagenet"))[0]
+    cif, caf = network(to_input(batch.pictures, recipe("street_fields").card))[0]
     return field_loss(cif, *batch.targets[:2]) + field_loss(caf, *batch.targets[2:])
 
 

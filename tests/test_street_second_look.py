@@ -10,12 +10,12 @@ import onnxruntime
 import pytest
 import torch
 
-from labeling.detection import decode_yolox
+from labeling.detection import decode_yolox, letterbox
 from labeling.model_cards import YoloxCard
 from labeling.schemas import Category
 from pipelines.model_variants import resized_detector
 from training.street_augment import AugmentSettings
-from training.street_batches import SecondLookBatches
+from training.street_batches import SecondLookBatches, to_input
 from training.street_export import export_model
 from training.street_losses import MINOR, match_candidates, second_look_loss
 from training.street_networks import FirstLook
@@ -36,7 +36,8 @@ from training.street_targets import encode_boxes, grid_cells
 WIDTH, HEIGHT = 256, 192
 CARD = YoloxCard(
     name="toy", file="toy.onnx", licence="", source="", classes=("car", "person"), categories={"car": "car"},
-    input_width=WIDTH, input_height=HEIGHT, nms_threshold=1.0,
+    input_width=WIDTH, input_height=HEIGHT, nms_threshold=1.0, mean=(128.0, 128.0, 128.0),
+    std=(64.0, 64.0, 64.0),
 )  # fmt: skip
 
 
@@ -225,7 +226,7 @@ def run_graph(path: Path, pictures: torch.Tensor) -> np.ndarray:
 
 def test_the_graph_scores_candidates_and_nothing_else(exported) -> None:
     network, card, folder = exported
-    pictures = torch.rand(2, 3, HEIGHT, WIDTH) * 255
+    pictures = torch.rand(2, 3, HEIGHT, WIDTH) * 4 - 2
     rows = run_graph(folder / card.file, pictures)
     with torch.no_grad():
         first, second = network(pictures)
@@ -241,22 +242,20 @@ def test_the_graph_scores_candidates_and_nothing_else(exported) -> None:
     assert len(found) == (scores[0] > card.score_threshold).sum()
 
 
-def test_contrast_folded_into_the_stem_changes_nothing(exported) -> None:
-    network, pictures = exported[0], torch.rand(1, 3, HEIGHT, WIDTH) * 255
-    folded = copy.deepcopy(network)
-    folded.first.fold_contrast()
-    with torch.no_grad():
-        wanted, given = network.first.look(pictures), folded.first.look(pictures)
-    assert folded.first.contrast == 1 and network.first.contrast == 1 / 64
-    torch.testing.assert_close(given.rows, wanted.rows, atol=1e-4, rtol=1e-4)
-    torch.testing.assert_close(given.fine, wanted.fine, atol=1e-4, rtol=1e-4)
+def test_training_and_labelling_make_the_same_of_a_picture(exported) -> None:
+    card = exported[1]
+    picture = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    given, ratio = letterbox(picture, card)
+    wanted = to_input(torch.from_numpy(picture)[None], card)[0]
+    assert ratio == 1 and np.array_equal(given, wanted.numpy())
+    assert np.array_equal(given, (picture[..., ::-1].transpose(2, 0, 1) - np.float32(128)) / np.float32(64))
 
 
 def test_the_graph_keeps_to_the_size_of_its_picture(exported, tmp_path: Path, monkeypatch) -> None:
     network, card, folder = exported
     monkeypatch.setattr("pipelines.model_variants.find_weights", lambda card: folder / card.file)
     larger = resized_detector(card, tmp_path, width=320, height=224)
-    pictures = torch.rand(1, 3, 224, 320) * 255
+    pictures = torch.rand(1, 3, 224, 320) * 4 - 2
     rows = run_graph(tmp_path / larger.file, pictures)
     with torch.no_grad():
         np.testing.assert_allclose(rows, TwoLookGraph(network)(pictures), atol=0.05)

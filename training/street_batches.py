@@ -3,14 +3,13 @@
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import cv2
 import numpy as np
 import torch
 
 from labeling.detection import LETTERBOX_GREY
-from labeling.model_cards import IMAGENET_MEAN, IMAGENET_STD
+from labeling.model_cards import IMAGENET_MEAN, ModelCard
 from labeling.schemas import Category, KeypointSchema, keypoint_schema
 from training.street_augment import AugmentSettings, disturb, map_boxes, map_points, put_board, random_map
 from training.street_losses import MINOR
@@ -56,14 +55,12 @@ class Batch:
         return Batch(pictures=change(self.pictures), targets=tuple(change(target) for target in self.targets))
 
 
-def to_input(pictures: torch.Tensor, normalisation: Literal["imagenet", "bgr255"]) -> torch.Tensor:
-    """(N, 3, H, W) float32 normalised network input, channels last in memory, from (N, H, W, 3) uint8 RGB."""
+def to_input(pictures: torch.Tensor, card: ModelCard) -> torch.Tensor:
+    """(N, 3, H, W) float32 network input as ``card`` says, channels last in memory, from (N, H, W, 3) uint8 RGB."""
     batch = pictures.permute(0, 3, 1, 2)
-    if normalisation == "bgr255":
-        return batch.flip(1).float().contiguous(memory_format=torch.channels_last)
-    mean, std = (
-        batch.new_tensor(values, dtype=torch.float32).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD)
-    )
+    if card.channel_order == "bgr":
+        batch = batch.flip(1)
+    mean, std = (batch.new_tensor(values, dtype=torch.float32).view(1, 3, 1, 1) for values in (card.mean, card.std))
     return ((batch.float() - mean) / std).contiguous(memory_format=torch.channels_last)
 
 

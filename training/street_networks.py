@@ -15,7 +15,6 @@ from labeling.schemas import keypoint_schema
 
 DETECTOR_STRIDES = (8, 16, 32)
 FIELD_STRIDE = 8
-_MIDDLE_LEVEL, _CONTRAST = 128.0, 1 / 64
 """A detector's stem sees levels less the one, times the other."""
 MAX_LOG_SIZE = 5.0
 """Sides of no object are more cells than its exponential."""
@@ -109,7 +108,6 @@ class StreetDetector(nn.Module):
     ) -> None:
         super().__init__()
         self.fine_channels = widths[0]
-        self.contrast = _CONTRAST
         self.trunk = Trunk(widths, depths, waists)
         self.pyramid = Pyramid(widths[1:], width)
         self.tower = nn.ModuleList(conv_unit(width, width) if built else nn.Identity() for built in towers)
@@ -118,21 +116,12 @@ class StreetDetector(nn.Module):
         nn.init.constant_(self.head.bias[4:5], -4.6)  # type: ignore[index]
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
-        """(N, 3, H, W) BGR 0 to 255 to (N, A, 5 + C): offset x, y, log size w, h, then logits."""
+        """(N, 3, H, W) normalised BGR to (N, A, 5 + C): offset x, y, log size w, h, then logits."""
         return self.look(pictures).rows
-
-    def fold_contrast(self) -> None:
-        """Take the scaling of levels into the stem's weights: nothing changes but that a picture is read once less."""
-        convolution = self.trunk.stem[0]
-        assert isinstance(convolution, nn.Conv2d)
-        with torch.no_grad():
-            convolution.weight.mul_(self.contrast)
-        self.contrast = 1.0
 
     def look(self, pictures: torch.Tensor) -> "FirstLook":
         """As ``forward``, with the features that led there."""
-        centred = pictures - _MIDDLE_LEVEL
-        fine = self.trunk.stem(centred if self.contrast == 1 else centred * self.contrast)
+        fine = self.trunk.stem(pictures)
         levels = self.pyramid(self.trunk.refine(fine))[: len(DETECTOR_STRIDES)]
         towers = [tower(x) for tower, x in zip(self.tower, levels, strict=True)]
         return FirstLook(

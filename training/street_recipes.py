@@ -43,6 +43,8 @@ _SECOND_COUNT, _SECOND_RATE = 6, 1e-4
 """Whole pictures of a batch for the second look, and the peak rate at which the first look goes on learning."""
 _SECOND_AUGMENT = AugmentSettings(night=0.15, weather=0.2)
 """What is taken for an object in bad weather or at night is for the second look to tell."""
+_MIDDLE_LEVELS, _CONTRAST = (128.0, 128.0, 128.0), (64.0, 64.0, 64.0)
+"""Of the detector's input: taken off with the levels' table, which costs nothing, not in the graph (2 ms a frame)."""
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
 _HEAD_WIDTHS = {"car24": (32, 56, 88), "coco17": (32, 56, 88, 72)}
 _HIDDEN_WEIGHTS = {"car24": 1.0, "coco17": 2.0}
@@ -160,10 +162,10 @@ def _detector_recipe(settings: FitSettings, again: FitSettings, enlarge: int) ->
 
     def first_loss(network: nn.Module, batch: Batch) -> torch.Tensor:
         assert isinstance(network, TwoLookDetector)
-        return cell_loss(network.first(to_input(batch.pictures, "bgr255")), batch)
+        return cell_loss(network.first(to_input(batch.pictures, card)), batch)
 
     def both_losses(network: nn.Module, batch: Batch) -> torch.Tensor:
-        first, second = network(to_input(batch.pictures, "bgr255"))
+        first, second = network(to_input(batch.pictures, card))
         judged = second_look_loss(
             second, *batch.targets[3:], size=PICTURE_SIZE, low_px=JUDGED_HEIGHT_PX * PICTURE_SCALE
         )
@@ -172,6 +174,7 @@ def _detector_recipe(settings: FitSettings, again: FitSettings, enlarge: int) ->
     card = YoloxCard(
         name=settings.name, file=f"{settings.name}.onnx", licence=_LICENCE, source=_DETECTOR_SOURCE, classes=CLASSES,
         categories={name: name for name in CLASSES}, input_width=PICTURE_SIZE[0], input_height=PICTURE_SIZE[1],
+        mean=_MIDDLE_LEVELS, std=_CONTRAST,
         # The second look leaves one box of each object.
         score_threshold=0.4, nms_threshold=1.0, max_detections=OBJECTS, decided_classes=CLASSES,
     )  # fmt: skip
@@ -194,7 +197,7 @@ def _head_recipe(schema: str, settings: FitSettings, enlarge: int) -> Recipe:
     )  # fmt: skip
 
     def loss(network: nn.Module, batch: Batch) -> torch.Tensor:
-        along_x, along_y, seen = (output.float() for output in network(to_input(batch.pictures, "imagenet")))
+        along_x, along_y, seen = (output.float() for output in network(to_input(batch.pictures, card)))
         wanted_x, wanted_y, weights, visible, tolerance = batch.targets
         return simcc_loss(
             (along_x, along_y, seen), (wanted_x, wanted_y), weights, visible, tolerance,
@@ -224,7 +227,7 @@ def _field_recipe(settings: FitSettings, enlarge: int) -> Recipe:
     columns, rows = ((side - 1) // FIELD_STRIDE + 1 for side in _FIELD_SIZE)
 
     def loss(network: nn.Module, batch: Batch) -> torch.Tensor:
-        fields = [field for pair in network(to_input(batch.pictures, "imagenet")) for field in pair]
+        fields = [field for pair in network(to_input(batch.pictures, card)) for field in pair]
         truths = zip(fields, batch.targets[::2], batch.targets[1::2], strict=True)
         return torch.stack([field_loss(*truth) for truth in truths]).sum()
 

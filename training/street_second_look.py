@@ -9,7 +9,6 @@ that of each object one candidate is left: nothing needs to be suppressed afterw
 Shape suffixes as in ``street_networks``; M candidates of a picture, Q points sampled in a box.
 """
 
-import copy
 from dataclasses import dataclass
 
 import torch
@@ -309,7 +308,7 @@ class TwoLookDetector(nn.Module):
         self.second = SecondLook(classes, fine=self.first.fine_channels, pyramid=self.first.head.in_channels)
 
     def forward(self, pictures: torch.Tensor) -> tuple[FirstLook, SecondScores]:
-        """Both looks at (N, 3, H, W) BGR 0 to 255, H and W multiples of 32.
+        """Both looks at (N, 3, H, W) normalised BGR, H and W multiples of 32.
 
         Where the second looks is not learnt from what it sees there: candidates carry no gradient.
         """
@@ -329,8 +328,7 @@ class TwoLookGraph(nn.Module):
 
     def __init__(self, network: TwoLookDetector) -> None:
         super().__init__()
-        self.network = copy.deepcopy(network)
-        self.network.first.fold_contrast()
+        self.network = network
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
         """``output`` (N, A, 5 + C); the best class of a candidate is sure to be its class if it is anything."""
