@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import onnxruntime
 
@@ -74,8 +75,9 @@ def rtmlib_detector(card: YoloxCard, path: Path | None = None) -> Callable[[np.n
     peer: Any = _one_thread(partial(YOLOX, model_input_size=size, **settings), card, path)
     if card.mean != (0, 0, 0) or card.std != (1, 1, 1):
         # It knows no normalisation for YOLOX.
-        mean, std, infer = np.array(card.mean, np.float32), np.array(card.std, np.float32), peer.inference
-        peer.inference = lambda picture: infer((picture - mean) / std)
+        levels, infer = (np.arange(256)[:, None] - np.array(card.mean)) / np.array(card.std), peer.inference
+        table = levels.astype(np.float32)[None]
+        peer.inference = lambda picture: infer(cv2.LUT(picture, table))
     return peer
 
 
