@@ -117,10 +117,12 @@ def _keep_memory() -> None:
             library.mallopt(parameter, value)
 
 
-def evaluate(folder: Path, *, streets: int = JUDGED_STREETS, frames: int = JUDGED_FRAMES) -> dict[str, float]:
+def evaluate(
+    folder: Path, *, streets: int = JUDGED_STREETS, frames: int = JUDGED_FRAMES, workers: int = 1
+) -> dict[str, float]:
     """Figures of the models in ``folder`` on held-out streets, through the labelling code."""
     models, tally = open_models(folder), Tally()
-    for rgb, truths in judging_frames(HELD_OUT_SEED, streets, frames):
+    for rgb, truths in judging_frames(HELD_OUT_SEED, streets, frames, workers=workers):
         judge_frame(models, rgb, truths, tally)
     figures = tally.figures()
     if models.detector is not None and streets > 1:
@@ -182,7 +184,7 @@ def train_all(options: argparse.Namespace) -> None:
             plan.graph(load_finished(plan.network(), job.checkpoint(plan.lessons[-1]))), plan.card, options.out
         )
     streets = CHOOSING_STREETS * options.judged_streets // JUDGED_STREETS
-    frames = list(judging_frames(VALIDATION_SEED, streets, JUDGED_FRAMES))
+    frames = list(judging_frames(VALIDATION_SEED, streets, JUDGED_FRAMES, workers=options.workers))
     choose_thresholds(options.out, options.only, frames)
 
 
@@ -234,7 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.train_only:
         print(f"{time.perf_counter() - start:.0f} s")
         return
-    figures = evaluate(options.out, streets=options.judged_streets)
+    figures = evaluate(options.out, streets=options.judged_streets, workers=options.workers)
     write_figures(options.out, figures, frames=options.judged_streets * JUDGED_FRAMES)
     for key, value in figures.items():
         print(f"{key:32s} {value:.4f}")

@@ -1,8 +1,12 @@
 """Which streets the street models learn from, which choose their thresholds, and which judge them."""
 
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import chain
+from multiprocessing import get_context
 
+import cv2
 import numpy as np
 
 from dataset.street import Scenario, Street, StreetConfig
@@ -76,10 +80,27 @@ def _plan(config: StreetConfig, index: int, *, frames: int, every: int) -> Rende
     return RenderPlan(config=config, frames=tuple(range(index % every, frames * every, every)))
 
 
-def judging_frames(first_seed: int, streets: int, frames: int) -> Iterator[tuple[np.ndarray, tuple[ObjectTruth, ...]]]:
-    """Rendered frames ((H, W, 3) uint8 RGB) with their truth, 17 frames apart, ``frames`` of each street."""
-    for plan in plan_streets(first_seed, streets, frames=frames, every=17):
-        street = Street(plan.config)
-        for index in plan.frames:
-            frame = street.render(index)
-            yield frame.rgb, truths_of(frame)
+def judging_frames(
+    first_seed: int, streets: int, frames: int, *, workers: int = 1
+) -> Iterator[tuple[np.ndarray, tuple[ObjectTruth, ...]]]:
+    """Rendered frames ((H, W, 3) uint8 RGB) with their truth, 17 frames apart, ``frames`` of each street.
+
+    Args:
+        first_seed: of the first street.
+        streets: how many.
+        frames: of each.
+        workers: processes that render ahead, streets in parallel; 1 renders here. The frames are the same.
+    """
+    plans = plan_streets(first_seed, streets, frames=frames, every=17)
+    if workers == 1:
+        yield from chain.from_iterable(map(_whole_frames, plans))
+        return
+    one_thread_each = {"initializer": cv2.setNumThreads, "initargs": (1,)}
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), **one_thread_each) as pool:
+        yield from chain.from_iterable(pool.map(_whole_frames, plans))
+
+
+def _whole_frames(plan: RenderPlan) -> list[tuple[np.ndarray, tuple[ObjectTruth, ...]]]:
+    street = Street(plan.config)
+    frames = [street.render(index) for index in plan.frames]
+    return [(frame.rgb, truths_of(frame)) for frame in frames]
