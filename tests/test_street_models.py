@@ -25,7 +25,7 @@ from training.street_losses import detector_loss, field_loss, simcc_loss
 from training.street_models import evaluate
 from training.street_models import main as train_street_models
 from training.street_networks import FieldGraph, FieldNetwork, Sharpening, SimccGraph, SimccNetwork, StreetDetector
-from training.street_plans import plan_streets
+from training.street_plans import judging_frames, plan_streets
 from training.street_pool import PICTURE_SIZE, ObjectTruth, PoolCrop, PoolFrame, StreetPool, render_pool
 from training.street_recipes import MODEL_NAMES, recipe
 from training.street_scores import distance_to_curve
@@ -531,6 +531,14 @@ def test_what_ships_is_small_and_keeps_its_cards() -> None:
         OnnxModel(card, SHIPPED_CARDS / card.file)
         assert card.accuracy and "32 px" in card.notes
         onnx.checker.check_model(str(SHIPPED_CARDS / card.file))
+
+
+def test_streets_rendered_side_by_side_are_the_same_and_in_order() -> None:
+    alone, together = (list(judging_frames(91_000, 3, 1, workers=workers)) for workers in (1, 2))
+    assert len(alone) == len(together) == 3
+    for (rgb, truths), (other, same) in zip(alone, together, strict=True):
+        assert np.array_equal(rgb, other) and len(truths) == len(same)
+        assert all(np.array_equal(a.box_xyxy, b.box_xyxy) for a, b in zip(truths, same, strict=True))
 
 
 @pytest.mark.slow
