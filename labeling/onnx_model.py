@@ -160,13 +160,13 @@ def network_input(picture: np.ndarray, card: ModelCard, *, out: np.ndarray | Non
     planes = np.empty((3, *picture.shape[:2]), np.float32) if out is None else out
     channels = cv2.split(picture)
     order = channels[::-1] if card.channel_order == "bgr" else channels
-    for i, levels in enumerate(_levels(card.mean, card.std)):
+    for i, levels in enumerate(level_table(card.mean, card.std)):
         cv2.LUT(order[i], levels, planes[i])
     return planes
 
 
 @functools.lru_cache(maxsize=16)
-def _levels(mean: tuple[float, float, float], std: tuple[float, float, float]) -> np.ndarray:
+def level_table(mean: tuple[float, float, float], std: tuple[float, float, float]) -> np.ndarray:
     """(3, 256) float32: what each level of each channel becomes, rounded once."""
     values = (np.arange(256) - np.array(mean)[:, None]) / np.array(std)[:, None]
     return values.astype(np.float32)

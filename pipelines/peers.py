@@ -15,6 +15,7 @@ from labeling.errors import ModelError
 from labeling.extractors import ExtractorChoice
 from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
 from labeling.model_cards import ModelCard, SimccCard, YoloxCard, find_weights
+from labeling.onnx_model import level_table
 from labeling.schemas import Category
 from pipelines.keypoint_clips import KeypointClip
 
@@ -75,8 +76,7 @@ def rtmlib_detector(card: YoloxCard, path: Path | None = None) -> Callable[[np.n
     peer: Any = _one_thread(partial(YOLOX, model_input_size=size, **settings), card, path)
     if card.mean != (0, 0, 0) or card.std != (1, 1, 1):
         # It knows no normalisation for YOLOX.
-        levels, infer = (np.arange(256)[:, None] - np.array(card.mean)) / np.array(card.std), peer.inference
-        table = levels.astype(np.float32)[None]
+        table, infer = level_table(card.mean, card.std).T[None], peer.inference
         peer.inference = lambda picture: infer(cv2.LUT(picture, table))
     return peer
 

@@ -180,7 +180,7 @@ def _fields(receipt):
 def test_workers_die_with_their_parent(tmp_path):
     code = (
         "import sys; from pathlib import Path\n"
-        "from pipelines.engine import Engine, minding_workers; from test_engine import Task, item\n"
+        "from pipelines.engine import Engine; from test_engine import Task, item\n"
         "if __name__ == '__main__':\n"
         "    with Engine(Path(sys.argv[1]), workers=1) as engine:\n"
         "        list(engine.run([Task(item=item('a', do='slow'))]))\n"

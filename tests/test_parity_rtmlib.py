@@ -27,6 +27,8 @@ import pytest
 from labeling.detection import Detector
 from labeling.keypoints import KeypointHead, plan_crop
 from labeling.model_cards import SimccCard, YoloxCard, load_cards
+from pipelines.keypoint_clips import HELD_OUT_SEED, street_extractors, street_frames
+from pipelines.peers import rtmlib_detector
 
 HEAD_SIZE = (192, 256)
 
@@ -86,6 +88,19 @@ def test_yolox_gives_rtmlibs_boxes_within_half_a_pixel(real_data: Path) -> None:
             assert np.abs(mine - box).max(axis=1).min() < 0.5
         total += len(theirs)
     assert total > 30
+
+
+def test_levels_are_centred_for_rtmlib_as_a_card_says() -> None:
+    """The shipped detector takes them so, and rtmlib knows of nothing of the kind."""
+    clip = street_frames("traffic", HELD_OUT_SEED, 1)
+    ours = street_extractors().detector
+    assert ours is not None and ours.card.mean != (0, 0, 0)
+    (found,) = ours.detect(clip.frames)
+    boxes, _ = rtmlib_detector(ours.card)(np.ascontiguousarray(clip.frames[0][:, :, ::-1]))
+    height, width = clip.frames[0].shape[:2]
+    boxes = np.clip(boxes, 0, [width, height, width, height])
+    assert len(found) > 5 and len(boxes) == len(found)
+    np.testing.assert_allclose(boxes[np.lexsort(boxes.T)], found.boxes_xyxy[np.lexsort(found.boxes_xyxy.T)], atol=0.5)
 
 
 def test_simcc_gives_rtmlibs_keypoints_within_a_hundredth_of_a_pixel(real_data: Path, random_head: Path) -> None:

@@ -15,7 +15,6 @@ from labeling.schemas import keypoint_schema
 
 DETECTOR_STRIDES = (8, 16, 32)
 FIELD_STRIDE = 8
-"""A detector's stem sees levels less the one, times the other."""
 MAX_LOG_SIZE = 5.0
 """Sides of no object are more cells than its exponential."""
 

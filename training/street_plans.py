@@ -95,8 +95,8 @@ def judging_frames(
     if workers == 1:
         yield from chain.from_iterable(map(_whole_frames, plans))
         return
-    one_thread_each = {"initializer": cv2.setNumThreads, "initargs": (1,)}
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), **one_thread_each) as pool:
+    spawn = get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
         yield from chain.from_iterable(pool.map(_whole_frames, plans))
 
 

@@ -44,7 +44,8 @@ _SECOND_COUNT, _SECOND_RATE = 6, 1e-4
 _SECOND_AUGMENT = AugmentSettings(night=0.15, weather=0.2)
 """What is taken for an object in bad weather or at night is for the second look to tell."""
 _MIDDLE_LEVELS, _CONTRAST = (128.0, 128.0, 128.0), (64.0, 64.0, 64.0)
-"""Of the detector's input: taken off with the levels' table, which costs nothing, not in the graph (2 ms a frame)."""
+"""Of the detector's input, as its card says them: labelling looks levels up in a table anyway, and a graph that
+centred them would read the picture once more."""
 _HEAD_SIZES = {"car24": (128, 96), "coco17": (64, 128)}
 _HEAD_WIDTHS = {"car24": (32, 56, 88), "coco17": (32, 56, 88, 72)}
 _HIDDEN_WEIGHTS = {"car24": 1.0, "coco17": 2.0}
