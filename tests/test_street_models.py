@@ -1,5 +1,7 @@
 """Street models: targets decode to the truth through the labelling code, training steps learn, what ships holds."""
 
+import weakref
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +28,7 @@ from training.street_models import evaluate
 from training.street_models import main as train_street_models
 from training.street_networks import FieldGraph, FieldNetwork, Sharpening, SimccGraph, SimccNetwork, StreetDetector
 from training.street_plans import judging_frames, plan_streets
-from training.street_pool import PICTURE_SIZE, ObjectTruth, PoolCrop, PoolFrame, StreetPool, render_pool
+from training.street_pool import PICTURE_SIZE, ObjectTruth, PoolCrop, PoolFrame, RenderPlan, StreetPool, render_pool
 from training.street_recipes import MODEL_NAMES, recipe
 from training.street_scores import distance_to_curve
 from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses, grid_cells
@@ -463,7 +465,16 @@ def test_a_second_lesson_goes_on_where_the_first_ended(
     monkeypatch.setattr("training.street_recipes._SECOND_COUNT", 1)
     command = ["--only", "street_detector", "--streets", "1", "--share", "0.0002", "--workers", "1", "--train-only"]
     command += ["--checkpoints", str(tmp_path), "--out", str(tmp_path)]
+    learnt_from: list[weakref.ref] = []
+
+    def remembered(plans: Sequence[RenderPlan], *, workers: int) -> StreetPool:
+        pool = render_pool(plans, workers=workers)
+        learnt_from.append(weakref.ref(pool.frames[0].picture))
+        return pool
+
+    monkeypatch.setattr("training.street_models.render_pool", remembered)
     train_street_models(command)
+    assert len(learnt_from) == 2 and not any(picture() is not None for picture in learnt_from), "pools are large"
     first, second = tmp_path / "street_detector.pt", tmp_path / "street_detector_second_look.pt"
     assert {first, second} == set(tmp_path.iterdir())
     assert capsys.readouterr().out.count("7 frames") == 2
