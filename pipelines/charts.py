@@ -17,6 +17,7 @@ import numpy as np
 
 from dataset.receipts import atomic_write, storage_errors, try_folder
 from labeling.errors import ConfigError
+from pipelines.label_placing import place_labels
 
 CHARTS: dict[str, str] = {
     "count": "pipelines.charts_count",
@@ -32,7 +33,9 @@ CHARTS: dict[str, str] = {
 CostKind = Literal["ms_per_frame", "ms_per_step", "ms_per_clip"]
 
 
-_LETTER_PX, _LINE_PX = 8.4, 20.0
+_LETTER_PX = 8.4
+_NAMED_DIGITS = "125"
+"""First digits of the ticks of a log axis that are named."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,10 +212,20 @@ def _draw_panel(axes: Any, points: Sequence[ChartPoint]) -> None:
         # Zero, the reference's own error, has no logarithm.
         least = 10.0 ** np.floor(np.log10(min(errors)))
         axes.set_yscale("symlog", linthresh=least) if len(errors) < len(points) else axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        if axis.get_scale() != "linear":
+            axis.set_major_formatter(_named_tick)
+            axis.set_minor_formatter(_named_tick)
+            axis.set_tick_params(which="both", length=4, pad=4)
     axes.margins(x=0.18, y=0.12)
     axes.set_ylabel(f"{points[0].error.metric}, {points[0].error.unit} (median)")
     axes.grid(True, which="both", alpha=0.2)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _named_tick(value: float, _: int | None = None) -> str:
+    """A number as people write it, and nothing for the ticks between."""
+    return f"{value:g}" if value == 0 or f"{abs(value):e}"[0] in _NAMED_DIGITS else ""
 
 
 def _name_points(axes: Any, points: Sequence[ChartPoint]) -> None:
@@ -229,38 +242,3 @@ def _name_points(axes: Any, points: Sequence[ChartPoint]) -> None:
         )  # fmt: skip
         # Names must not move what they were placed against.
         name.set_in_layout(False)
-
-
-def place_labels(
-    points_xy: np.ndarray, widths: Sequence[float], bounds: tuple[float, float, float, float]
-) -> list[tuple[float, float]]:
-    """Where each name starts, relative to its point: on either side, above or below, clear of what stands already.
-
-    Args:
-        points_xy: (n, 2) pixels, y upwards.
-        widths: of the names, pixels.
-        bounds: left, bottom, right, top of the axes, pixels.
-    """
-    points = np.asarray(points_xy, dtype=np.float64)
-    boxes = np.zeros((0, 4))
-    placed: list[tuple[float, float]] = [(0.0, 0.0)] * len(points)
-    half = _LINE_PX / 2
-    for index in np.argsort(-points[:, 1], kind="stable"):
-        candidates = [
-            (right, float(up))
-            for up in range(-150, 151, 15)
-            for right in (12.0, -12.0 - widths[index])
-            if up or right > 0
-        ]
-        corners = np.array([(right, up - half, right + widths[index], up + half) for right, up in candidates])
-        corners += np.tile(points[index], 2)
-        covered = ((points >= corners[:, None, :2] - 5) & (points <= corners[:, None, 2:] + 5)).all(axis=-1).sum(axis=1)
-        overlaps = (
-            (corners[:, None, :2] < boxes[None, :, 2:]) & (boxes[None, :, :2] < corners[:, None, 2:])
-        ).all(axis=-1).sum(axis=1)  # fmt: skip
-        outside = (corners[:, :2] < bounds[:2]).any(axis=1) | (corners[:, 2:] > bounds[2:]).any(axis=1)
-        far = np.array([abs(up) + (25 if right < 0 else 0) for right, up in candidates])
-        best = int((1000 * overlaps + 400 * outside + 300 * covered + far).argmin())
-        boxes = np.concatenate([boxes, corners[best : best + 1]])
-        placed[index] = candidates[best]
-    return placed

@@ -15,12 +15,13 @@ from pipelines.charts import (
     ChartPoint,
     Cost,
     Error,
+    _named_tick,
     interleaved_ms,
     pareto_front,
-    place_labels,
     run_chart,
     write_chart,
 )
+from pipelines.label_placing import crossing, place_labels
 from pipelines.stability import judged, make_table, run_stability, write_stability
 
 
@@ -86,6 +87,41 @@ def test_names_are_clear_of_each_other_and_inside() -> None:
     crossed = ((low[:, None] < high[None]) & (low[None] < high[:, None])).all(axis=-1)
     assert crossed.sum() == len(points)
     assert (low >= 0).all() and (high <= [800, 500]).all()
+
+
+def test_leaders_cross_neither_each_other_nor_names() -> None:
+    points = np.array([(300.0, 200.0), (318.0, 200.0), (322.0, 200.0), (280.0, 240.0), (326.0, 240.0)])
+    widths = [124.0, 75.0, 120.0, 60.0, 30.0]
+    starts = points + np.array(place_labels(points, widths, (0.0, 0.0, 800.0, 500.0)))
+    middles = starts + np.array([(width / 2, 0.0) for width in widths])
+    leaders = np.stack([points, middles], axis=1)
+    assert not crossing(leaders[:, None], leaders[None]).any()
+    low, high = starts - [0, 10], starts + [(width, 10) for width in widths]
+    for corner in (low, high):
+        other = low + high - corner
+        across = np.stack([corner, np.stack([other[:, 0], corner[:, 1]], axis=1)], axis=1)
+        mine = np.eye(len(points), dtype=bool)
+        assert not (crossing(leaders[:, None], across[None]) & ~mine).any()
+
+
+@pytest.mark.parametrize(
+    ("line", "other", "cross"),
+    [
+        ([(0, 0), (2, 2)], [(0, 2), (2, 0)], True),
+        ([(0, 0), (2, 2)], [(1, 1), (2, 0)], False),
+        ([(0, 0), (2, 2)], [(3, 0), (5, 2)], False),
+        ([(0, 0), (2, 0)], [(1, 1), (1, 5)], False),
+    ],
+    ids=["through", "touching", "apart", "short"],
+)
+def test_lines_cross(line: list[tuple[int, int]], other: list[tuple[int, int]], cross: bool) -> None:
+    lines = np.array([line, other], np.float64)
+    assert bool(crossing(lines[0], lines[1])) is cross and bool(crossing(lines[1], lines[0])) is cross
+
+
+def test_ticks_are_named_as_people_write_numbers() -> None:
+    named = [_named_tick(value) for value in (0, 0.02, 0.05, 0.3, 1, 20, 70, 100, 5000)]
+    assert named == ["0", "0.02", "0.05", "", "1", "20", "", "100", "5000"]
 
 
 def test_a_panel_for_each_error(tmp_path: Path) -> None:
