@@ -12,6 +12,7 @@ from itertools import count
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from labeling import box_motion as motion
 from labeling.boxes import iou
 from labeling.labels import UNTRACKED
 
@@ -20,14 +21,6 @@ _UNMATCHED = 1.0
 parked cars would change places rather than leave one out."""
 _PAST_FRAMES = 36
 """Frames over which a track remembers where it was seen."""
-_LEVER_FRAMES = 8
-"""Two sightings tell a speed when they are at least so far apart: boxes shake, and a walker's swings with the legs."""
-_SLOW_PX = 0.5
-"""Per frame: what is slower has no direction."""
-_WHOLE_SHARE = 0.75
-"""A box of less than this share of its usual width or height shows a part: the picture's border or a column cuts it."""
-_STEADY_GROWTH = 0.01
-"""Share by which the height of what comes neither nearer nor goes may change per frame: such objects move evenly."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +62,12 @@ class _Track:
     def box_xyxy(self) -> np.ndarray:
         centre, size = self.mean[:2, 0], np.exp(np.clip(self.mean[2:, 0], -3, 9))
         return np.concatenate([centre - size / 2, centre + size / 2])
+
+    def coast(self) -> None:
+        """Let an object that went behind something go on as it went before."""
+        known, state = motion.line(self.past)
+        if known:
+            self.mean = state
 
 
 class BoxTracker:
@@ -115,11 +114,13 @@ class BoxTracker:
         """
         boxes = np.asarray(boxes_xyxy, np.float64).reshape(-1, 4)
         for track in self._tracks:
-            _predict(track, frame_step)
+            motion.predict(track.mean, track.covariance, frame_step, track.lost_frames == 0)
+            track.lost_frames += frame_step
+            track.past[:, 0] += frame_step
             if previous_to_current is not None:
-                _move_with_camera(track, previous_to_current)
+                motion.move_with_camera(track.mean, track.past, previous_to_current)
             if carried and track.track_id in carried:
-                _correct(track, carried[track.track_id])
+                motion.correct(track.mean, track.covariance, np.asarray(carried[track.track_id], np.float64))
         ids = np.full(len(boxes), UNTRACKED)
         high = np.flatnonzero(scores >= self.settings.high_score)
         low = np.flatnonzero(scores < self.settings.high_score)
@@ -133,7 +134,7 @@ class BoxTracker:
         for track in seen:
             # Even where flow holds it: flow may hold the edge of what hides it.
             if track.lost_frames:
-                _coast(track)
+                track.coast()
         self._tracks = [track for track in self._tracks if track.lost_frames <= self.settings.max_lost_frames]
         return ids
 
@@ -153,49 +154,31 @@ class BoxTracker:
         overlap = np.where(lost, far, near)
         heights = np.log(_heights(boxes[chosen])[None] / _heights(predicted)[:, None])
         allowed = (overlap >= settings.min_overlap) & (np.abs(heights) <= np.log(settings.max_size_ratio))
-        back = np.stack(
-            [_turned_back(track, boxes[chosen], lost=bool(gone)) for track, gone in zip(tracks, lost, strict=True)]
+        turns = (
+            motion.turned_back(track.mean, track.past, boxes[chosen], gone)
+            for track, (gone,) in zip(tracks, lost, strict=True)
         )
-        cost = np.minimum(1 - overlap + lost * settings.lost_cost + settings.back_cost * back, _UNMATCHED)
+        cost = 1 - overlap + lost * settings.lost_cost + settings.back_cost * np.stack(list(turns))
+        # What costs as much as being left alone is left alone: between equals the solver would choose by a last digit.
+        allowed &= cost < _UNMATCHED
         rows, columns = linear_sum_assignment(np.where(allowed, cost, _UNMATCHED))
         taken = np.zeros(len(chosen), bool)
         for row, column in zip(rows, columns, strict=True):
             if allowed[row, column]:
                 taken[column] = True
-                _correct(tracks[row], boxes[chosen[column]])
+                motion.correct(tracks[row].mean, tracks[row].covariance, boxes[chosen[column]])
                 _remember(tracks[row], boxes[chosen[column]])
                 tracks[row].lost_frames = 0
                 ids[chosen[column]] = tracks[row].track_id
         return chosen[~taken]
 
     def _start(self, box_xyxy: np.ndarray) -> int:
-        mean = np.zeros((4, 2))
-        mean[:, 0] = _measurement(box_xyxy)
-        spread = np.array([_size_px(box_xyxy) * 0.1, _size_px(box_xyxy) * 0.1, 0.1, 0.1])
-        covariance = np.zeros((4, 2, 2))
-        covariance[:, 0, 0], covariance[:, 1, 1] = spread**2, spread**2
+        mean, covariance = motion.start(box_xyxy)
+        track_id = next(self._ids)
         self._tracks.append(
-            _Track(
-                track_id=next(self._ids), mean=mean, covariance=covariance, past=_sighting(box_xyxy), lost_frames=0
-            )
-        )  # fmt: skip
-        return self._tracks[-1].track_id
-
-
-def _turned_back(track: _Track, boxes_xyxy: np.ndarray, *, lost: bool) -> np.ndarray:
-    """(N,) by how much of its size each of (N, 4) boxes lies behind where a track is expected, against its motion.
-
-    What was just seen whole may turn: 0.
-    """
-    state = track.mean if lost else _line_while_partly_hidden(track)
-    if state is None:
-        return np.zeros(len(boxes_xyxy))
-    (centre, velocity), size = state[:2].T, np.exp(np.clip(state[2:, 0], -3, 9))
-    speed = float(np.hypot(*velocity))
-    if speed < _SLOW_PX:
-        return np.zeros(len(boxes_xyxy))
-    ahead = ((boxes_xyxy[:, :2] + boxes_xyxy[:, 2:]) / 2 - centre) @ velocity / speed
-    return np.clip(-ahead / size.min(), 0, 1)
+            _Track(track_id=track_id, mean=mean, covariance=covariance, past=_sighting(box_xyxy), lost_frames=0)
+        )
+        return track_id
 
 
 def _grown(boxes_xyxy: np.ndarray, buffer: float) -> np.ndarray:
@@ -207,89 +190,10 @@ def _heights(boxes_xyxy: np.ndarray) -> np.ndarray:
     return np.maximum(boxes_xyxy[:, 3] - boxes_xyxy[:, 1], 1e-3)
 
 
-def _size_px(box_xyxy: np.ndarray) -> float:
-    return float(np.maximum(box_xyxy[2:] - box_xyxy[:2], 1e-3).mean())
-
-
-def _measurement(box_xyxy: np.ndarray) -> np.ndarray:
-    size = np.maximum(box_xyxy[2:] - box_xyxy[:2], 1e-3)
-    return np.concatenate([(box_xyxy[:2] + box_xyxy[2:]) / 2, np.log(size)])
-
-
 def _sighting(box_xyxy: np.ndarray) -> np.ndarray:
     """(1, 5) row of ``_Track.past``."""
-    return np.concatenate([[0.0], _measurement(box_xyxy)])[None]
+    return np.concatenate([[0.0], motion.measurement(box_xyxy)])[None]
 
 
 def _remember(track: _Track, box_xyxy: np.ndarray) -> None:
     track.past = np.concatenate([track.past[track.past[:, 0] < _PAST_FRAMES], _sighting(box_xyxy)])
-
-
-def _coast(track: _Track) -> None:
-    """Let an object that went behind something go on as it went before."""
-    line = _line(track)
-    if line is not None:
-        track.mean = line
-
-
-def _line_while_partly_hidden(track: _Track) -> np.ndarray | None:
-    """The line of a track whose last sighting was of a part; None for one that was seen whole, or has no line."""
-    return None if _seen_whole(track)[-1] else _line(track)
-
-
-def _seen_whole(track: _Track) -> np.ndarray:
-    """(n,) which sightings are of the whole object."""
-    usual = np.median(track.past[:, 3:], axis=0)
-    return (track.past[:, 3:] >= usual + np.log(_WHOLE_SHARE)).all(axis=1)
-
-
-def _line(track: _Track) -> np.ndarray | None:
-    """(4, 2) state of an object that goes on as it went while it was seen whole; None where nothing tells how.
-
-    Its last boxes before something hides it are what was left in view: their middle stops at the edge of that. The line
-    through most sightings does not (Theil 1950, Sen 1968: the median of the slopes of pairs, of which three in ten may
-    be wrong).
-    """
-    whole = _seen_whole(track)
-    ago, places = -track.past[whole, 0], track.past[whole, 1:]
-    first, second = np.triu_indices(len(ago), 1)
-    apart = ago[second] - ago[first]
-    far = apart >= _LEVER_FRAMES
-    if not far.any():
-        return None
-    slopes = np.median((places[second] - places[first])[far] / apart[far, None], axis=0)
-    if abs(slopes[3]) > _STEADY_GROWTH:
-        return None
-    centre = np.median(places[:, :2] - slopes[:2] * ago[:, None], axis=0)
-    size = np.median(places[:, 2:], axis=0)
-    return np.stack([np.concatenate([centre, size]), np.array([*slopes[:2], 0.0, 0.0])], axis=1)
-
-
-def _predict(track: _Track, steps: int) -> None:
-    transition = np.array([[1.0, steps], [0.0, 1.0]])
-    if track.lost_frames:
-        # A rate of growth is measured badly: it is not trusted once nothing confirms it.
-        track.mean[2:, 1] *= 0.8**steps
-    track.mean = track.mean @ transition.T
-    # White acceleration (Bar-Shalom et al. 2001, eq. 6.3.2-4), in shares of the object's size per frame squared.
-    size = float(np.exp(np.clip(track.mean[2:, 0].mean(), -3, 9)))
-    strength = np.array([0.012 * size, 0.012 * size, 0.006, 0.006]) ** 2
-    noise = np.array([[steps**3 / 3, steps**2 / 2], [steps**2 / 2, steps]])
-    track.covariance = transition @ track.covariance @ transition.T + strength[:, None, None] * noise
-    track.lost_frames += steps
-    track.past = track.past + np.array([steps, 0, 0, 0, 0])
-
-
-def _correct(track: _Track, box_xyxy: np.ndarray) -> None:
-    sigma = np.array([0.03 * _size_px(box_xyxy), 0.03 * _size_px(box_xyxy), 0.04, 0.04])
-    innovation = _measurement(box_xyxy) - track.mean[:, 0]
-    gain = track.covariance[:, :, 0] / (track.covariance[:, 0, 0] + sigma**2)[:, None]
-    track.mean = track.mean + gain * innovation[:, None]
-    track.covariance = track.covariance - gain[:, :, None] * track.covariance[:, :1, :]
-
-
-def _move_with_camera(track: _Track, previous_to_current: np.ndarray) -> None:
-    centres = np.concatenate([track.mean[None, :2, 0], track.past[:, 1:3]])
-    moved = np.concatenate([centres, np.ones((len(centres), 1))], axis=1) @ previous_to_current.T
-    centres = moved[:, :2] / moved[:, 2:]
-    track.mean[:2, 0], track.past[:, 1:3] = centres[0], centres[1:]
