@@ -248,6 +248,9 @@ class CifcafCard(ModelCard, frozen=True):
         names = [name for head in self.heads for name in (head.cif, head.caf)]
         if len(set(names)) != len(names):
             raise ValueError(f"two heads read the same output: {names}")
+        categories = [keypoint_schema(head.schema_name).category for head in self.heads]
+        if len(set(categories)) != len(categories):
+            raise ValueError(f"two heads give the same category: {categories}; leave one of them out")
         return self
 
     def output_shapes(self) -> dict[str, Dimensions]:

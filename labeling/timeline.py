@@ -107,7 +107,7 @@ class RunFrames:
     source_time_s: np.ndarray
     """(N,) float64."""
     duplicate: np.ndarray
-    """(N,) bool, as in ``Timeline``."""
+    """(N,) bool, shows the picture of the frame before: the same source frame, or the next of a camera that froze."""
     hole: np.ndarray
     """(N,) bool, in a gap of the source, or its source frame did not decode: it shows a neighbour instead."""
     cut: np.ndarray
@@ -300,7 +300,7 @@ def cut_run(
     return RunFrames(
         frame=np.arange(span.start, span.end, dtype=np.int32),
         source_time_s=wanted.copy(),
-        duplicate=timeline.duplicate[span.start : span.end].copy(),
+        duplicate=run.repeated,
         hole=timeline.hole[span.start : span.end] | run.lost,
         cut=run.cuts(),
     )

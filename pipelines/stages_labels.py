@@ -39,7 +39,7 @@ class KeypointsStage:
             video_id, run = parse_run_item(name)
             items.append(
                 WorkItem(
-                    stage=self.name, name=name, owner=video_id, version=3, settings=settings, models=models,
+                    stage=self.name, name=name, owner=video_id, version=4, settings=settings, models=models,
                     inputs={output.path: output.sha256 for output in receipt.outputs},
                     outputs=(run_path(video_id, run, ".keypoints.parquet"),), weight=float(len(run)),
                     payload={"models_dir": str(job.models_dir) if job.models_dir else None},
@@ -63,6 +63,7 @@ class KeypointsStage:
             labels = label_frames(
                 read_frames(root / run_path(video_id, run, ".mp4")), first_frame=run.start,
                 extractors=extractors, effort=item.settings["keypoints"]["effort"], breaks=run_breaks(frames),
+                repeats=frozenset(frames.frame[frames.duplicate].tolist()),
             )  # fmt: skip
             left_out = {name: count - before[name] for name, count in extractors.left_out.items()}
         outside = [label.frame for label in labels if not run.start <= label.frame < run.end]

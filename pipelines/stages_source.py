@@ -123,7 +123,7 @@ class CutStage:
             for run in runs:
                 items.append(
                     WorkItem(
-                        stage=self.name, name=run_item(video_id, run), owner=video_id, version=1, settings=settings,
+                        stage=self.name, name=run_item(video_id, run), owner=video_id, version=2, settings=settings,
                         inputs={"index": index[video_id].output("index.parquet").sha256, "run": [run.start, run.end]},
                         outputs=(run_path(video_id, run, ".mp4"), run_path(video_id, run, ".frames.parquet")),
                         payload={"path": str(job.sources[video_id].path), "index": index_path(video_id)},

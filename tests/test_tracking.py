@@ -10,7 +10,7 @@ import pytest
 from labeling.backward_tracking import reach_back
 from labeling.box_tracker import BoxTracker, TrackerSettings
 from labeling.boxes import iou
-from labeling.labels import UNTRACKED, Keypoints
+from labeling.labels import POINT_INTERPOLATED, UNTRACKED, Keypoints
 from labeling.lane_tracker import LaneTracker, line_distance
 from labeling.tracking import RunTracker, TrackedLook, believed_tracks, drop_brief_tracks, trim_doubt
 
@@ -191,6 +191,13 @@ def test_a_track_that_was_never_sure_twice_in_a_row_is_not_believed() -> None:
         assert believed_tracks(seen, min_looks=2) == {0}
 
 
+@pytest.mark.parametrize(("at", "believed"), [((4, 6, 8), set()), ((4, 5), {0})], ids=["with gaps", "in a row"])
+def test_sure_looks_are_in_a_row_only_where_none_missed_it(at: tuple[int, ...], believed: set[int]) -> None:
+    seen = looks(*([car(t, 100)] if t in at else [] for t in range(10)))
+    assert {label.track_id for look in seen for label in look.labels} == {0}
+    assert believed_tracks(seen, min_looks=2, sure_looks=2, sure_scores={"car": 0.5}) == believed
+
+
 def test_a_track_is_shown_from_its_first_plain_frame_to_its_last() -> None:
     """What is doubtful before and after goes; in between it stays, and so does what has no doubt."""
     plain = {3, 4, 9}
@@ -204,9 +211,17 @@ def test_a_track_is_shown_from_its_first_plain_frame_to_its_last() -> None:
 
 def test_brief_tracks_are_dropped_but_where_a_run_begins_or_ends() -> None:
     long, brief = ([replace(car(t, 100), track_id=n) for t in range(*span)] for n, span in enumerate(((0, 9), (3, 7))))
-    assert drop_brief_tracks([*long, *brief], min_frames=5) == long
-    assert drop_brief_tracks([*long, *brief], min_frames=4) == [*long, *brief]
-    assert drop_brief_tracks([*long, *brief], min_frames=5, open_at=(6, 20)) == [*long, *brief]
+    clocks = range(9)
+    assert drop_brief_tracks([*long, *brief], clocks, min_frames=5) == long
+    assert drop_brief_tracks([*long, *brief], clocks, min_frames=4) == [*long, *brief]
+    assert drop_brief_tracks([*long, *brief], clocks, min_frames=5, open_at=(6, 20)) == [*long, *brief]
+
+
+def test_how_long_a_track_lasts_goes_by_the_clock() -> None:
+    """Four moments of two frames of the grid each last eight; of three that a camera froze in between, no longer."""
+    track = [replace(car(t, 100), track_id=0) for t in range(3, 7)]
+    assert drop_brief_tracks(track, range(0, 18, 2), pace=2, min_frames=8) == track
+    assert drop_brief_tracks(track, range(0, 18, 2), pace=2, min_frames=9) == []
 
 
 def test_a_sure_track_reaches_back_to_what_was_unsure() -> None:
@@ -217,6 +232,21 @@ def test_a_sure_track_reaches_back_to_what_was_unsure() -> None:
     assert sorted(label.frame for label in found) == [0, 1, 2, 4, 5]
     assert {label.track_id for label in found} == {0} and {label.score for label in found} == {0.3}
     assert reach_back(seen, set()) == []
+
+
+def test_what_is_reached_back_to_is_shown_between_looks() -> None:
+    """Looks every 6 frames; the third missed it, so that nothing is shown around that."""
+    every, sure = 6, 4
+    frames = [[] if n == 2 else [replace(car(n * every, 100), score=0.9 if n >= sure else 0.3)] for n in range(7)]
+    tracker = RunTracker()
+    seen = [
+        TrackedLook(frame=n * every, labels=tuple(tracker.update(labels, frame=n * every)), turn=np.eye(3))
+        for n, labels in enumerate(frames)
+    ]
+    found = reach_back(seen, {0})
+    assert sorted(label.frame for label in found) == [*range(7), *range(18, 24)]
+    between = [label for label in found if label.frame % every]
+    assert all((label.point_source[label.present] == POINT_INTERPOLATED).all() for label in between)
 
 
 def test_no_track_reaches_back_to_what_is_elsewhere_or_long_ago() -> None:
