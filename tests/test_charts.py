@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from labeling.errors import ConfigError, StorageError
 from pipelines.charts import (
+    CHARTS,
     Chart,
     ChartPoint,
     Cost,
@@ -22,7 +24,7 @@ from pipelines.charts import (
     write_chart,
 )
 from pipelines.label_placing import crossing, place_labels
-from pipelines.stability import judged, make_table, run_stability, write_stability
+from pipelines.stability import STABILITY, judged, make_table, run_stability, write_stability
 
 
 def point(method: str, ms: float, error: float, *, reference: bool = False) -> ChartPoint:
@@ -156,6 +158,15 @@ def test_verdicts(limits: dict[str, Any], verdict: str) -> None:
 def test_tables_are_written(tmp_path: Path) -> None:
     write_stability(make_table("ego", "a street", [judged("night", 2.0, unit="m", at_most=3)]), tmp_path)
     assert json.loads((tmp_path / "stability-ego.json").read_text())["rows"][0]["verdict"] == "held"
+
+
+@pytest.mark.parametrize(("table", "called"), [(CHARTS, "chart"), (STABILITY, "stability")], ids=["chart", "stability"])
+def test_every_name_has_a_module_that_can_be_run(table: dict[str, str], called: str) -> None:
+    """Read and not imported: some of them load torch."""
+    for module in table.values():
+        spec = find_spec(module)
+        assert spec is not None and spec.origin is not None, module
+        assert f"\ndef {called}(" in Path(spec.origin).read_text(), module
 
 
 def test_unknown_names_list_the_known(tmp_path: Path) -> None:

@@ -552,7 +552,6 @@ def test_streets_rendered_side_by_side_are_the_same_and_in_order() -> None:
         assert all(np.array_equal(a.box_xyxy, b.box_xyxy) for a, b in zip(truths, same, strict=True))
 
 
-@pytest.mark.slow
 def test_what_ships_is_accurate_on_streets_it_never_saw() -> None:
     figures = evaluate(SHIPPED_CARDS, streets=6, frames=3)
     short = {name: figures[name] for name, floor in FLOORS.items() if figures[name] < floor}

@@ -122,6 +122,24 @@ def test_each_category_may_begin_at_a_score_of_its_own() -> None:
         assert (named.track_id != UNTRACKED) is bool(begun)
 
 
+def test_growth_is_not_believed_while_nothing_confirms_it() -> None:
+    """A car comes nearer by 3 % a frame, stops where something hides it for a second, and is found where it stopped."""
+    sizes = [30 * 1.03 ** min(t, 30) for t in range(70)]
+    path = [box(300, width=size, height=size) if not 30 <= t < 54 else None for t, size in enumerate(sizes)]
+    ids = follow([path])[:, 0]
+    assert set(ids[54:]) == set(ids[:30]) == {0}
+
+
+@pytest.mark.parametrize(("times", "same"), [(1.7, True), (2.1, False)], ids=["a little", "a lot"])
+def test_what_is_suddenly_much_larger_is_another_object(times: float, same: bool) -> None:
+    for first, second in ((1.0, times), (times, 1.0)):
+        tracker = BoxTracker()
+        before, after = (
+            tracker.update(box(300, width=40, height=100 * size)[None], np.ones(1))[0] for size in (first, second)
+        )
+        assert bool(before == after) is same
+
+
 def test_frame_steps_scale_the_prediction() -> None:
     every, fourth = BoxTracker(), BoxTracker()
     dense = [every.update(box(50 + 5 * t)[None], np.ones(1))[0] for t in range(40)]
