@@ -13,6 +13,7 @@ from dataset.tables import EgoTable
 from dataset.trajectory_marks import FAINT, INK, add_line, moment_colours, tidy
 
 _LEAST_SPAN_M = 6.0
+_LEAST_SHOWN_M = np.array([3.0, 2.0])
 _VIEW_SHARE = 0.11
 """How far a view reaches, of the way's span."""
 _HEADS_PER_VIEW = 0.26
@@ -121,7 +122,7 @@ def _fitted(plan: Plan) -> Plan:
     drawn = np.concatenate([plan.way, *(plan.view(moment) for moment in plan.moments), _label_spots(plan)])
     margin = 0.35 * plan.reach_m
     low, high = drawn.min(axis=0) - margin, drawn.max(axis=0) + margin
-    lacking = np.maximum(0.0, _LEAST_SPAN_M / np.array([1.0, 2.0]) - (high - low)) / 2
+    lacking = np.maximum(0.0, _LEAST_SHOWN_M - (high - low)) / 2
     return Plan(
         way=plan.way, looks=plan.looks, moments=plan.moments, reach_m=plan.reach_m, half_angle=plan.half_angle,
         low=low - lacking, high=high + lacking,
