@@ -116,6 +116,10 @@ def test_every_scenario_of_the_table_is_played():
     assert {"still", "turn", "crawl", "fast", "wall", "road_only", "reverse"} <= set(SCENARIOS)
 
 
+def test_names_of_methods_stand_by_themselves():
+    assert not [name for name in charts_ego._METHODS if "the same" in name]
+
+
 def test_windows_are_five_seconds_or_the_clip():
     clip = made_up_clip()
     assert charts_ego._window(clip) == 14
