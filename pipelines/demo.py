@@ -17,7 +17,8 @@ import numpy as np
 import yaml
 from rich.table import Table
 
-from dataset.inspection import clip_record, contact_sheet, find_sample, summarize
+from dataset.contact_sheet import contact_sheet
+from dataset.inspection import clip_record, find_sample, summarize
 from dataset.loader import Sample, ShardDataset
 from dataset.pictures import write_picture
 from dataset.receipts import atomic_write, make_folder

@@ -17,7 +17,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from dataset.inspection import SHEET_ROWS, Summary, contact_sheet, find_sample, summarize
+from dataset.contact_sheet import SHEET_ROWS, contact_sheet
+from dataset.inspection import Summary, find_sample, summarize
 from dataset.loader import Sample, ShardDataset
 from dataset.receipts import atomic_write
 from dataset.selection import Selection, read_selection
@@ -130,7 +131,7 @@ def _label_sections(root: Path, status: JobStatus, summary: Summary) -> list[Sec
             Section(
                 title="Clips at a glance",
                 pictures=[
-                    Picture(data=png_data(contact_sheet(clip)), caption=f"{clip.key}: eight moments")
+                    Picture(data=png_data(contact_sheet(clip)), caption=f"{clip.key}: four moments")
                     for clip in _some_clips(root)
                 ],
             )

@@ -10,7 +10,7 @@ from typing import Literal
 from dataset.receipts import atomic_write, storage_errors, try_folder
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
-from pipelines.reliability import ReliabilityCurve, draw_reliability
+from pipelines.reliability import ReliabilityBin, ReliabilityCurve, draw_reliability
 
 STABILITY: dict[str, str] = {
     "ego": "pipelines.stability_ego",
@@ -93,9 +93,25 @@ def write_stability(table: StabilityTable, out: Path) -> None:
     text = json.dumps(values, indent=1, ensure_ascii=False) + "\n"
     atomic_write(out / f"stability-{table.stage}.json", text.encode())
     if table.curves:
-        picture = out / f"reliability-{table.stage}.png"
-        with storage_errors(picture):
-            draw_reliability(table.curves, picture, title=f"{table.stage}: can scores be believed?", note=table.data)
+        draw_curves(table, out)
+
+
+def draw_curves(table: StabilityTable, out: Path) -> None:
+    """``reliability-<stage>.png`` in the folder ``out``."""
+    picture = out / f"reliability-{table.stage}.png"
+    with storage_errors(picture):
+        draw_reliability(table.curves, picture, title=f"{table.stage}: what a score says", note=table.data)
+
+
+def read_stability(path: Path) -> StabilityTable:
+    """A table as ``write_stability`` wrote it, to be drawn again without being measured again."""
+    values = json.loads(path.read_text(encoding="utf-8"))
+    rows = tuple(StabilityRow(**row) for row in values.pop("rows"))
+    curves = tuple(
+        ReliabilityCurve(**curve | {"bins": tuple(ReliabilityBin(**one) for one in curve["bins"])})
+        for curve in values.pop("curves", [])
+    )
+    return StabilityTable(**values, rows=rows, curves=curves)
 
 
 def make_table(stage: str, data: str, rows: Sequence[StabilityRow]) -> StabilityTable:

@@ -26,7 +26,7 @@ from pipelines.keypoint_harm import (
     label_clip,
     spliced,
 )
-from pipelines.reliability import NEAR_NINE, reliability_curve, share_right
+from pipelines.reliability import NEAR_NINE, PointKind, reliability_curve, share_right
 from pipelines.scored_points import scored_points
 from pipelines.stability import StabilityRow, StabilityTable, judged, make_table
 from pipelines.track_errors import track_score
@@ -66,7 +66,8 @@ def stability(*, quick: bool = False) -> StabilityTable:
             points = {"undisturbed": _points_of(clean), "in every condition": scored}
         if not quick:
             rows += _played(clips, clean, effort)
-    curves = tuple(reliability_curve(name, found) for name, found in points.items())
+    kinds: tuple[PointKind, ...] = ("in view", "hidden")
+    curves = tuple(reliability_curve(name, found, kind=kind) for name, found in points.items() for kind in kinds)
     rows += _reliability(points)
     names = ", ".join(dict.fromkeys(clip.name for clip in clips))
     data = (

@@ -9,7 +9,8 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from dataset.inspection import Spread, Summary, clip_record, contact_sheet, drop_reasons, find_sample, summarize
+from dataset.contact_sheet import contact_sheet
+from dataset.inspection import Spread, Summary, clip_record, drop_reasons, find_sample, summarize
 from dataset.loader import ShardDataset
 from dataset.pictures import write_picture
 from dataset.receipts import read_receipts, reason_counts

@@ -125,7 +125,8 @@ def run_study(
         ConfigError: the folder holds a study of another plan, or a budget too small; a report with nothing to report.
         StorageError: the folder cannot be written to.
     """
-    from pipelines.study_report import draw_intervals, draw_sheet
+    from pipelines.study_picture import draw_study
+    from pipelines.study_report import draw_sheet
 
     plan = plan_study(quick=quick) if minutes is None else plan_study(minutes, quick=quick)
     study = Study(plan=plan, out=out, say=say)
@@ -139,7 +140,7 @@ def run_study(
                     study.recorded(_arm_record(arm, seed), lambda arm=arm, seed=seed: run_arm(study, arm, seed))
         result = conclude(study, seeds=_complete_seeds(study))
         atomic_write(out / "study.json", (json.dumps(result, indent=1, sort_keys=True) + "\n").encode())
-        draw_intervals(result, out / "study.png")
+        draw_study(result, out / "study.png")
         draw_sheet(out / "shown", out / "study-sheet.png")
     return result
 

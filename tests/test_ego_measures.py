@@ -190,6 +190,10 @@ def test_the_chart_tells_its_methods_apart(tmp_path):
     assert turned_deg[default] < 0.5 * turned_deg[stock]
 
 
+def test_names_of_methods_stand_by_themselves():
+    assert not [name for name in charts_ego._METHODS if "the same" in name]
+
+
 def test_windows_are_five_seconds_or_the_clip():
     clip = made_up_clip()
     assert charts_ego._window(clip) == 14

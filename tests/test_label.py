@@ -8,7 +8,8 @@ import pytest
 from pipeline_fixtures import CLIP, HEIGHT, WIDTH, run_all, small_config, tree, write_detector, write_street
 from video_fixtures import cut_off, write_audio_only
 
-from dataset.inspection import contact_sheet, summarize
+from dataset.contact_sheet import TILE, contact_sheet
+from dataset.inspection import summarize
 from dataset.loader import ShardDataset
 from dataset.receipts import read_receipts
 from dataset.selection import read_selection
@@ -304,10 +305,11 @@ def test_without_a_detector_clips_cannot_be_ranked(tmp_path, videos, monkeypatch
 def test_the_sheet_of_a_packed_clip_shows_its_four_videos(counted):
     sample = ShardDataset(counted.root)[0]
     sheet = contact_sheet(sample)
-    assert sheet.dtype == np.uint8 and sheet.shape[1] > 8 * 264 and sheet.shape[0] > 4 * 176
-    rgb = cv2.resize(sample.frames("rgb.mp4")[0], (264, 176), interpolation=cv2.INTER_NEAREST)
-    tiles = sheet[-4 * 182 - 6 : -4 * 182 - 6 + 176, 92 : 92 + 264]
-    assert np.array_equal(tiles, rgb)
+    width, height = TILE
+    assert sheet.dtype == np.uint8 and sheet.shape[1] > 4 * width and sheet.shape[0] > 4 * height
+    rgb = cv2.resize(sample.frames("rgb.mp4")[0], TILE, interpolation=cv2.INTER_NEAREST)
+    top, left = sheet.shape[0] - 4 * (height + 6) - 6, sheet.shape[1] - 4 * (width + 6) - 6
+    assert np.array_equal(sheet[top : top + height, left : left + width], rgb)
 
 
 def test_parts_are_read_strictly():

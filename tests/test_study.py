@@ -3,7 +3,9 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from dataset.street import Street, StreetConfig
 from dataset.street_segments import SEGMENTS
 from labeling.camera import Trajectory, rigid
 from labeling.errors import ConfigError, DataError
+from pipelines.study_picture import BESIDES, FIGURES, draw_study, shared_reason
 from training.metrics import mean_interval
 from training.study_judge import PAIR_FRAMES, JudgeClip, chained, motion_of, pair_batch
 from training.study_plan import ARMS, QUESTIONS, plan_study
@@ -170,6 +173,38 @@ def test_no_verdict_without_a_judge_without_motion_or_with_two_seeds():
     holds = judge_gate("keypoint_error", truth, trivial, more_is_better=False, unit="px")
     assert holds.holds
     assert find(good, bad, gate=holds, **sides).verdict == "better"
+
+
+def told(*verdicts: tuple[str, str]) -> dict[str, Any]:
+    """A study's tree with a question for each (verdict, reason)."""
+    gap = {"mean": 0.1, "low": -0.2, "high": 0.4}
+    questions = [
+        {"text": f"a against b{n}", "first": "a", "second": f"b{n}", "verdict": verdict,
+         "figures": {name: {"verdict": verdict, "reason": reason, "difference": gap} for name in FIGURES}}
+        for n, (verdict, reason) in enumerate(verdicts)
+    ]  # fmt: skip
+    arms = ["a", *(question["second"] for question in questions), *BESIDES]
+    return {
+        "questions": questions, "arms": {arm: dict.fromkeys(FIGURES, gap) for arm in arms}, "seeds": [0, 1, 2],
+        "plan": {"scale": {"val_clips": 4}}, "processor_s": {"in all": 60.0},
+    }  # fmt: skip
+
+
+def test_a_reason_that_all_questions_share_is_said_once():
+    reason = "neither arm surely beats the first frame held"
+    assert shared_reason(told(("inconclusive", reason), ("inconclusive", reason)), "min_ade").endswith(reason)
+    assert shared_reason(told(("inconclusive", reason), ("better", "the whole interval is above 0")), "min_ade") == ""
+
+
+def test_every_verdict_and_what_arms_stand_beside_are_drawn(tmp_path):
+    result = told(*((verdict, verdict) for verdict in ("better", "worse", "no difference", "inconclusive")))
+    draw_study(result, tmp_path / "all.png")
+    # Arms of a smoke run may lack a figure, and a study may have been drawn before a baseline was known.
+    result["arms"].pop("[another street]")
+    result["arms"]["b0"].pop("keypoint_error")
+    draw_study(result, tmp_path / "fewer.png")
+    whole, fewer = (cv2.imread(str(tmp_path / name)) for name in ("all.png", "fewer.png"))
+    assert whole is not None and fewer is not None and whole.shape == fewer.shape and (whole != fewer).any()
 
 
 def test_segments_agree_with_the_boxes_and_the_horizon():
