@@ -195,7 +195,8 @@ def _point(method: str, results: Sequence[_Result], clips: Sequence[KeypointClip
     return ChartPoint(
         method=method, settings=figures, reference=method in ("first look kept", "exact"),
         ms_per_frame=Cost(
-            median=float(np.average(spent, weights=sizes)), p95=float(np.max(spent)), runs=len(clips)
+            median=float(np.average(spent, weights=sizes)), p95=float(np.max(spent)), runs=len(clips),
+            over="clips",
         ),
         error=Error(
             metric="visible points not within 0.1 of the box diagonal", unit="%", median=_wrong(results),

@@ -18,6 +18,7 @@ from pipelines.charts import (
     Cost,
     Error,
     _named_tick,
+    draw_chart,
     interleaved_ms,
     pareto_front,
     run_chart,
@@ -69,6 +70,20 @@ def test_a_picture_that_cannot_be_written_is_an_error_of_storage(tmp_path: Path)
     (tmp_path / "chart-ego.png").mkdir()
     with pytest.raises(StorageError, match=r"chart-ego\.png: is a directory"):
         write_chart(Chart(stage="ego", data="a street", points=POINTS, machine="a machine"), tmp_path)
+
+
+def test_each_group_has_a_front_of_its_own(tmp_path: Path) -> None:
+    """One point of another group changes nothing in the front of the first, and is on its own."""
+
+    def blue(points: tuple[ChartPoint, ...]) -> int:
+        """Pixels in the colour of points on a front."""
+        draw_chart(Chart(stage="a", data="", points=points, machine=""), tmp_path / "a.png")
+        picture = cv2.imread(str(tmp_path / "a.png"))
+        assert picture is not None
+        return int((np.abs(picture.astype(int) - (0xB0, 0x6C, 0x2B)).max(axis=2) < 4).sum())
+
+    beaten = point("other", 3, 8.0)
+    assert blue((*POINTS, replace(beaten, group="b"))) > 1.2 * blue((*POINTS, beaten))
 
 
 def test_another_cost_goes_by_its_own_name(tmp_path: Path) -> None:
