@@ -45,7 +45,8 @@ class Carried:
 
     label: Keypoints
     followed: bool
-    """False: too little of it could be followed; the points are where the last motion leaves them."""
+    """False: too little of it could be followed; the points are where the motion of what could be takes them, or where
+    they were."""
 
 
 def small_grey(frame: np.ndarray) -> np.ndarray:

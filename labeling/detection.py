@@ -38,7 +38,8 @@ class Detections:
     categories: np.ndarray
     """(N,) str: ``car`` or ``person``, or empty where the class is counted but not labelled."""
     left_out: int = 0
-    """How many more there were than the card's ``max_detections``."""
+    """How many more there were than the card's ``max_detections``, at least: of more than some thousands the worst are
+    not counted."""
 
     def __len__(self) -> int:
         return len(self.scores)

@@ -1,8 +1,8 @@
 """Frames of a run to tracked, steady keypoints, looking no more often than the scene needs.
 
 The networks are nearly all the cost. With ``exact`` they see every frame; with the other efforts they see some, and
-between these the points of cars and people are carried by optical flow, and lanes, which have no points of their own to
-follow, by straight lines. How often they look is ``efforts``'; what is shown in between is ``between_looks``'.
+between these points are carried by optical flow. Lanes of a network that gives nothing else have no points to follow
+and go by straight lines. How often they look is ``efforts``'; what is shown in between is ``between_looks``'.
 
 Flow and smoothing count moments (``moments``): a picture that is shown again is not looked at, and its labels are shown
 again. Tracks, how long until the next look, how long something must last, and how long after its last sight it may be

@@ -65,7 +65,7 @@ _FIELD_DECODING: dict[str, dict[str, float]] = {
 _LICENCE = "Apache-2.0"
 _DETECTOR_SOURCE = (
     "ships with Animatic; its first look was trained by `make street-models DEVICE=cuda`, which trains and exports the "
-    "same network from seeds; README tells how it went on"
+    "same network from seeds; docs/street_models.md tells how it went on"
 )
 _SOURCE = "ships with Animatic; `make street-models DEVICE=cuda` trains and exports it again from seeds"
 
@@ -104,7 +104,7 @@ BUDGETS: dict[Device, Budget] = {
     ),
 }  # fmt: skip
 """Two cores in under an hour; one GPU with sixteen cores in under ten minutes, from which the shipped models come, but
-for the detector, which went on from there (README)."""
+for the detector, which went on from there (``docs/street_models.md``)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
