@@ -9,12 +9,13 @@ import pytest
 
 from dataset.street import Street, StreetConfig
 from dataset.street_segments import SEGMENTS
+from labeling.boxes import iou
 from labeling.camera import Trajectory, rigid
 from labeling.errors import ConfigError, DataError
 from training.metrics import mean_interval
 from training.study_judge import PAIR_FRAMES, JudgeClip, chained, motion_of, pair_batch
 from training.study_plan import ARMS, QUESTIONS, plan_study
-from training.study_scores import CAP_PX, Reading, TrueTrack, clip_scores, track_scores, true_tracks
+from training.study_scores import CAP_PX, MATCH_IOU, Reading, TrueTrack, clip_scores, track_scores, true_tracks
 from training.study_shapes import shape_video
 from training.study_verdicts import Gate, find, judge_gate, paired_interval, table_of
 
@@ -84,6 +85,15 @@ def test_one_box_serves_one_car():
     tracks = [_still_track(), _still_track()]
     scores = track_scores(list(tracks[0].boxes_xyxy[:, None]), tracks)
     assert scores["recall"] == 0.5
+
+
+def test_overlaps_too_small_to_match_keep_no_true_pair_from_being_made():
+    # IoU of the first car with the boxes 0.43 and 0.25, of the second 0.25 and 0: 0.25 twice is more than 0.43 once.
+    tracks = [_still_track(box=(0, 0, 100, 10)), _still_track(box=(100, 0, 200, 10))]
+    boxes = np.array([[40, 0, 140, 10], [-60, 0, 40, 10]], float)
+    first, second = (iou(track.boxes_xyxy[:1], boxes)[0] for track in tracks)
+    assert first[0] >= MATCH_IOU > max(first[1], second[0]) and first[1] + second[0] > first[0] + second[1]
+    assert track_scores([boxes] * 4, tracks)["recall"] == 0.5
 
 
 def test_tracks_begin_in_the_first_frame_and_end_where_the_truth_shows_them_badly():
