@@ -8,6 +8,7 @@ import pytest
 from dataset.street_labels import StreetObject
 from labeling.labels import POINT_DETECTED, Keypoints
 from labeling.schemas import Category
+from pipelines.demo import CarComparison
 from pipelines.keypoint_clips import street_frames
 from pipelines.keypoint_errors import lane_score, longest_phantom, match_frames, phantom_frames, point_score, recall
 from pipelines.track_errors import PointSeries, jitter_px, lag_frames, point_series, track_score
@@ -47,6 +48,15 @@ def test_points_of_missed_objects_are_wrong() -> None:
     assert (score.right, score.shown) == (18, 48)
     assert recall([frame]) == (1, 2)
     assert np.isnan(point_score([frame], category="person").pck)
+
+
+def test_the_demo_lets_no_two_cars_share_a_label() -> None:
+    cars = CarComparison()
+    cars.add([label(0, 0, 100)], [thing(1, 100), thing(2, 110)], frame=0)
+    assert (cars.found, cars.right) == ([True, False], [True]), "one car of two, though both overlap it"
+    cars.add([label(5, 0, 100, off=2), label(5, 1, 110, score=0.8)], [thing(1, 100), thing(2, 900, share=0.1)], frame=5)
+    assert (cars.found[2:], cars.right[1:]) == ([True], [True, False]), "a second label of one car is wrong"
+    assert np.median(np.concatenate(cars.errors_px)) == pytest.approx(1.0)
 
 
 def test_recall_by_height() -> None:
