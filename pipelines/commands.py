@@ -15,7 +15,8 @@ from labeling.ego_import import FileClock
 from labeling.errors import ConfigError
 from labeling.extractors import ExtractorChoice, Extractors, choose_extractors
 from labeling.onnx_model import resolve_providers
-from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, with_effort
+from labeling.settings_files import read_yaml
+from pipelines.config import EFFORTS, Config, merged, parse_config, with_effort
 from pipelines.console import ConsoleReporter, counted, print_damaged, print_failures
 from pipelines.damage import damaged_videos
 from pipelines.engine import Engine

@@ -8,7 +8,8 @@ import yaml
 
 from dataset.receipts import Receipt, atomic_write, read_receipts
 from labeling.errors import ConfigError
-from pipelines.config import Config, parse_config, read_yaml
+from labeling.settings_files import read_yaml
+from pipelines.config import Config, parse_config
 from pipelines.sources import Source, absolute, read_source, same_id, source_values, with_leave_out
 from pipelines.stage import WorkItem, item_state, load_stage
 

@@ -24,9 +24,10 @@ from labeling.errors import ConfigError, DataError, VideoError
 from labeling.extractors import ExtractorChoice, choose_extractors
 from labeling.model_cards import find_weights, load_cards
 from labeling.onnx_files import weights_sha256
+from labeling.settings_files import parse_settings
 from labeling.timeline import ClipPlan, ClipSettings, Timeline, plan_clips, plan_timeline
 from labeling.video import decode_at
-from pipelines.config import CountSettings, PictureSettings, SelectSettings, parse_settings
+from pipelines.config import CountSettings, PictureSettings, SelectSettings
 from pipelines.job import Job
 from pipelines.layout import SELECTION, counts_path, index_path
 from pipelines.stage import NotReadyError, WorkItem
