@@ -18,6 +18,7 @@ from dataset.tables import read_keypoints
 from labeling.errors import ConfigError
 from labeling.labels import Keypoints
 from labeling.schemas import keypoint_schema
+from labeling.skeleton_video import DEFAULT_STYLE
 from labeling.timeline import FPS, Span
 from labeling.video import read_frames
 from pipelines.black_skeletons import print_black_skeletons
@@ -29,7 +30,7 @@ from pipelines.stages_source import job_selection
 COCO_IDS = {"coco17": 1, "wholebody133": 2, "openpose18": 3, "car66": 4, "car24": 5, "lane24": 6}
 """Category ids by schema, the same in every file so that files can be joined; 1 is COCO's own person."""
 
-VISIBLE_SCORE = 0.3
+VISIBLE_SCORE = DEFAULT_STYLE.min_score
 """Points scored below are labelled but not visible: what the skeleton video does not draw."""
 
 _JPEG_QUALITY = 95

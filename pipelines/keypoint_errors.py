@@ -13,11 +13,11 @@ import numpy as np
 from dataset.street_labels import StreetObject
 from labeling.labels import Keypoints
 from labeling.schemas import Category
+from training.criteria import JUDGED_HEIGHT_PX, JUDGED_SHARE, LANE_MATCH_PX
 from training.metrics import pck
-from training.street_scores import JUDGED_HEIGHT_PX, distance_to_curve, is_judged, match_boxes
+from training.street_scores import distance_to_curve, is_judged, match_boxes
 
 BODIES: tuple[Category, ...] = ("car", "person")
-_LANE_MATCH_PX = 20.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,7 +107,7 @@ def point_score(matched: Iterable[MatchedFrame], *, category: Category | None = 
 
 def recall(
     matched: Iterable[MatchedFrame], *, category: Category | None = None, from_px: float = JUDGED_HEIGHT_PX,
-    to_px: float = np.inf, least_share: float = 0.3,
+    to_px: float = np.inf, least_share: float = JUDGED_SHARE,
 ) -> tuple[int, int]:  # fmt: skip
     """Objects found, and objects asked for: of a height in ``[from_px, to_px)``, ``least_share`` of them visible."""
     asked = [
@@ -149,7 +149,7 @@ def lane_score(
                 continue
             gaps = [float(distance_to_curve(label.points[label.present, :2], line.points_xy).mean()) for line in free]
             best = int(np.argmin(gaps)) if gaps else -1
-            if best < 0 or gaps[best] > _LANE_MATCH_PX:
+            if best < 0 or gaps[best] > LANE_MATCH_PX:
                 phantoms += 1
                 continue
             errors.append(gaps[best])

@@ -30,13 +30,13 @@ from pipelines.reliability import NEAR_NINE, reliability_curve, share_right
 from pipelines.scored_points import scored_points
 from pipelines.stability import StabilityRow, StabilityTable, judged, make_table
 from pipelines.track_errors import track_score
+from training.criteria import HIDDEN_SCORE, JUDGED_SHARE
 
 EFFORTS: tuple[Effort, ...] = ("balanced", "exact")
 _SCENES: tuple[Scenario, ...] = ("traffic", "drive", "parked", "stop_and_go")
 _STREETS, _FRAMES, _START = 12, 32, 24
 """Three streets of each scene: one street is a few cars' luck, and a phantom counts for as many frames as it lasts."""
 _EMPTY_FPS = 8
-_HIDDEN_SCORE = 0.3
 _SIZES: dict[int, tuple[float, float]] = {48: (40.0, 57.0), 24: (20.0, 28.5), 12: (10.0, 14.2)}
 """Heights in pixels that are taken for 48, 24 and 12: within a fifth."""
 
@@ -204,7 +204,7 @@ def hidden_below(frames: Iterable[MatchedFrame]) -> tuple[float, int]:
         if label is not None
     ]
     pooled = np.concatenate([np.zeros(0), *scores])
-    return float((pooled < _HIDDEN_SCORE).mean()) if len(pooled) else float("nan"), len(pooled)
+    return float((pooled < HIDDEN_SCORE).mean()) if len(pooled) else float("nan"), len(pooled)
 
 
 def _small_cars(clean: list[list[MatchedFrame]], effort: Effort) -> list[StabilityRow]:
@@ -252,7 +252,7 @@ def column_passages(clip: KeypointClip) -> dict[int, int | None]:
     seen: dict[int, list[int]] = {}
     for frame, things in enumerate(clip.truth):
         for thing in things:
-            if thing.category == "person" and thing.visible_share > 0.3:
+            if thing.category == "person" and thing.visible_share > JUDGED_SHARE:
                 seen.setdefault(thing.track_id, []).append(frame)
     gaps = {
         track: [b for a, b in zip(frames[:-1], frames[1:], strict=True) if b - a > 6] for track, frames in seen.items()

@@ -12,10 +12,11 @@ from dataset.street_segments import SEGMENTS
 from labeling.boxes import iou
 from labeling.camera import Trajectory, rigid
 from labeling.errors import ConfigError, DataError
+from training.criteria import MATCH_IOU
 from training.metrics import mean_interval
 from training.study_judge import PAIR_FRAMES, JudgeClip, chained, motion_of, pair_batch
 from training.study_plan import ARMS, QUESTIONS, plan_study
-from training.study_scores import CAP_PX, MATCH_IOU, Reading, TrueTrack, clip_scores, track_scores, true_tracks
+from training.study_scores import CAP_PX, Reading, TrueTrack, clip_scores, track_scores, true_tracks
 from training.study_shapes import shape_video
 from training.study_verdicts import Gate, find, judge_gate, paired_interval, table_of
 

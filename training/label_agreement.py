@@ -14,12 +14,9 @@ from labeling.camera import PictureMap
 from labeling.errors import DataError
 from labeling.labels import Keypoints
 from labeling.skeleton_video import DEFAULT_STYLE
+from training.criteria import MATCH_IOU, PCK_SHARE
 from training.metrics import pck
 
-MATCH_IOU = 0.3
-"""Least overlap of two boxes that are taken for one object."""
-PCK_SHARE = 0.1
-"""Points within this share of the box diagonal are right."""
 LEAST_POINTS = 4
 """Objects that show fewer points are not compared."""
 LEAST_SCORE = DEFAULT_STYLE.min_score

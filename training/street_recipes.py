@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from labeling.model_cards import CifcafCard, FieldHeadCard, ModelCard, SimccCard, YoloxCard
+from training.criteria import JUDGED_HEIGHT_PX
 from training.street_augment import AugmentSettings
 from training.street_batches import (
     CLASSES,
@@ -29,7 +30,6 @@ from training.street_networks import (
     SimccNetwork,
 )
 from training.street_pool import PICTURE_SCALE, PICTURE_SIZE, StreetPool
-from training.street_scores import JUDGED_HEIGHT_PX
 from training.street_second_look import OBJECTS, TwoLookDetector, TwoLookGraph
 from training.street_targets import grid_cells
 

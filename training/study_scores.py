@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from labeling.boxes import best_pairs
+from training.criteria import MATCH_IOU
 from training.evaluation import trajectory_scores
 from training.study_judge import Reading
 
 CAP_PX = 12.0
 """The most that one car in one frame can count, pixels of the study's picture."""
-MATCH_IOU = 0.3
 LABEL_SCALE = 2.0
 """Boxes are in pixels of twice the picture."""
 FIGURES: dict[str, tuple[str, bool]] = {
