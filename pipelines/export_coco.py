@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dataset.layout import parse_run_item, run_path
 from dataset.receipts import atomic_write, make_folder, storage_errors
 from dataset.tables import read_keypoints
 from labeling.errors import ConfigError
@@ -24,7 +25,6 @@ from labeling.video import read_frames
 from pipelines.black_skeletons import print_black_skeletons
 from pipelines.console import counted, make_console
 from pipelines.job import Job, open_job
-from pipelines.layout import parse_run_item, run_path
 from pipelines.stages_source import job_selection
 
 COCO_IDS = {"coco17": 1, "wholebody133": 2, "openpose18": 3, "car66": 4, "car24": 5, "lane24": 6}
