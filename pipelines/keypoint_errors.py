@@ -126,13 +126,12 @@ def phantom_frames(matched: Sequence[MatchedFrame]) -> float:
     return sum(bool(frame.phantoms) for frame in matched) / max(1, len(matched))
 
 
-def longest_phantom(matched: Iterable[MatchedFrame]) -> int:
-    """Frames, first to last, over which one tracked phantom was shown; 0 without any."""
-    shown: dict[tuple[str, int], list[int]] = defaultdict(list)
-    for frame in matched:
-        for label in frame.phantoms:
-            shown[label.category, label.track_id].append(frame.frame)
-    return max((max(frames) - min(frames) + 1 for frames in shown.values()), default=0)
+def track_spans(labels: Iterable[Keypoints]) -> dict[int, int]:
+    """By track, the frames from its first label to its last, gaps counted."""
+    shown: dict[int, list[int]] = defaultdict(list)
+    for label in labels:
+        shown[label.track_id].append(label.frame)
+    return {track: max(frames) - min(frames) + 1 for track, frames in shown.items()}
 
 
 def lane_score(

@@ -48,7 +48,7 @@ def show_stability(stage: str, *, out: Path, quick: bool = False) -> int:
         table.add_column(column, justify="right" if column == "figure" else "left")
     colours = {"held": "green", "not held": "red", "reported": "dim"}
     for row in found.rows:
-        figure = "no answer" if row.figure is None else f"{row.figure:.4g} {row.unit}".strip()
+        figure = f"{row.figure:.4g} {row.unit}".strip()
         verdict = f"[{colours[row.verdict]}]{row.verdict}[/]"
         table.add_row(escape(row.scenario), escape(row.method), escape(figure), row.bound, verdict, escape(row.note))
     console = make_console()

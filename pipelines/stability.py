@@ -27,8 +27,8 @@ class StabilityRow:
 
     scenario: str
     method: str
-    figure: float | None
-    """What was measured; None where the method gave no answer and said so."""
+    figure: float
+    """What was measured."""
     unit: str
     bound: str
     """As a person reads it, such as ``<= 0.1``."""

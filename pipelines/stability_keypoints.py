@@ -16,7 +16,7 @@ from labeling.carrying import box_diagonal
 from labeling.extraction import Effort
 from labeling.labels import Keypoints
 from pipelines.keypoint_clips import HELD_OUT_SEED, KeypointClip, street_frames
-from pipelines.keypoint_errors import MatchedFrame, match_frames, phantom_frames, point_score, recall
+from pipelines.keypoint_errors import MatchedFrame, match_frames, phantom_frames, point_score, recall, track_spans
 from pipelines.keypoint_harm import (
     Board,
     behind_board,
@@ -314,15 +314,12 @@ def drift_shares(labels: Iterable[Keypoints], *, first: int, last: int) -> list[
 
 def _empty_road(effort: Effort) -> list[StabilityRow]:
     """A minute of a road without anybody, rendered as it is looked at: 3 GB of frames are not kept."""
-    labels = label_clip(empty_road(), effort=effort)
-    shown: dict[int, list[int]] = {}
-    for label in labels:
-        shown.setdefault(label.track_id, []).append(label.frame)
-    longest = max((max(frames) - min(frames) + 1 for frames in shown.values()), default=0)
+    phantoms = track_spans(label_clip(empty_road(), effort=effort))
+    longest = max(phantoms.values(), default=0)
     return [
         judged(
             "an empty road, 1 min", longest / 24, unit="s, the longest phantom", at_most=0.25, method=effort,
-            note=f"{len(shown)} phantom tracks; filmed at {_EMPTY_FPS} fps",
+            note=f"{len(phantoms)} phantom tracks; filmed at {_EMPTY_FPS} fps",
         )
     ]  # fmt: skip
 

@@ -10,7 +10,7 @@ from labeling.labels import POINT_DETECTED, Keypoints
 from labeling.schemas import Category
 from pipelines.demo import CarComparison
 from pipelines.keypoint_clips import street_frames
-from pipelines.keypoint_errors import lane_score, longest_phantom, match_frames, phantom_frames, point_score, recall
+from pipelines.keypoint_errors import lane_score, match_frames, phantom_frames, point_score, recall, track_spans
 from pipelines.track_errors import PointSeries, jitter_px, lag_frames, point_series, track_score
 
 GRID = np.stack(np.meshgrid(np.linspace(5, 75, 6), np.linspace(5, 55, 4)), axis=-1).reshape(-1, 2)
@@ -72,7 +72,7 @@ def test_phantoms_match_nothing_and_lie_on_nothing() -> None:
     matched = match_frames(found, truth)
     assert [[p.track_id for p in frame.phantoms] for frame in matched] == [[2], [2], []]
     assert phantom_frames(matched) == pytest.approx(2 / 3)
-    assert longest_phantom(matched) == 2
+    assert track_spans(label for frame in matched for label in frame.phantoms) == {2: 2}
 
 
 def test_lanes_by_hand() -> None:
