@@ -18,7 +18,7 @@ from training.study_judge import PAIR_FRAMES, JudgeClip, chained, motion_of, pai
 from training.study_plan import ARMS, QUESTIONS, plan_study
 from training.study_scores import CAP_PX, Reading, TrueTrack, clip_scores, track_scores, true_tracks
 from training.study_shapes import shape_video
-from training.study_verdicts import Gate, find, judge_gate, paired_interval, table_of
+from training.study_verdicts import Gate, crossed_interval, find, judge_gate, table_of
 
 HOLDS = Gate(figure="keypoint_error", holds=True, reason="")
 
@@ -138,7 +138,7 @@ def test_pairs_that_are_mirrored_or_reversed_keep_their_truth():
 
 def test_an_interval_of_one_seed_agrees_with_the_bootstrap_over_streets():
     values = np.random.default_rng(1).normal(size=24)
-    mine = paired_interval(values[None])
+    mine = crossed_interval(values[None])
     peer = mean_interval(list(values), [str(street) for street in range(24)])
     assert (mine.low, mine.high) == pytest.approx((peer.low, peer.high), abs=0.05)
     assert mine.mean == pytest.approx(values.mean())
@@ -146,9 +146,9 @@ def test_an_interval_of_one_seed_agrees_with_the_bootstrap_over_streets():
 
 def test_streets_that_ask_for_nothing_are_left_out_and_none_at_all_is_an_error():
     table = np.array([[1.0, np.nan, 3.0], [1.0, 5.0, 3.0]])
-    assert paired_interval(table).mean == 2.0
+    assert crossed_interval(table).mean == 2.0
     with pytest.raises(DataError, match="no paired differences"):
-        paired_interval(np.full((2, 3), np.nan))
+        crossed_interval(np.full((2, 3), np.nan))
     assert np.isnan(table_of([{"a": {}}], "recall", ["a", "b"])).all()
 
 
