@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dataset.layout import RECEIPTS, SELECTION, SHARD_INDEX
 from dataset.loader import Sample, ShardDataset
 from dataset.receipts import Receipt, read_receipts, reason_counts
 from dataset.selection import ClipRow, Selection, read_selection
@@ -75,13 +76,13 @@ def summarize(job: Path) -> Summary:
     Raises:
         DataError: the folder holds no selection yet.
     """
-    if not (job / "selection.parquet").is_file():
+    if not (job / SELECTION).is_file():
         raise DataError(f"{job}: holds no selection; make one with `animatic label VIDEO... --out {job}`")
-    selection = read_selection(job / "selection.parquet")
+    selection = read_selection(job / SELECTION)
     # By the stages that there are receipts of: which there may be is for the pipeline to know.
-    logged = {folder.name for folder in (job / "receipts").glob("*") if folder.is_dir()}
+    logged = {folder.name for folder in (job / RECEIPTS).glob("*") if folder.is_dir()}
     receipts = {stage: read_receipts(job, stage) for stage in sorted(logged | {"index", "render"})}
-    index_file = job / "shards" / "index.parquet"
+    index_file = job / SHARD_INDEX
     rows = read_shard_index(index_file) if index_file.is_file() else []
     lengths = {row.key: row.end - row.start for row in selection.rows}
     splits = {row.key: row.split for row in rows}
@@ -109,7 +110,7 @@ def drop_reasons(job: Path) -> dict[str, str]:
     Raises:
         DataError: the folder holds no selection.
     """
-    return _drop_reasons(read_selection(job / "selection.parquet"), read_receipts(job, "render"))
+    return _drop_reasons(read_selection(job / SELECTION), read_receipts(job, "render"))
 
 
 def _drop_reasons(selection: Selection, rendered: Mapping[str, Receipt]) -> dict[str, str]:
@@ -139,7 +140,7 @@ def clip_verdict(job: Path, key: str) -> ClipRow:
     Raises:
         DataError: no clip has that key.
     """
-    rows = read_selection(job / "selection.parquet").rows
+    rows = read_selection(job / SELECTION).rows
     for row in rows:
         if row.key == key:
             return row
@@ -157,7 +158,7 @@ def find_sample(job: Path, key: str | None = None) -> Sample:
     for dataset in datasets:
         if key in dataset.keys or (key is None and len(dataset)):
             return dataset.sample(key or dataset.keys[0])
-    if key is not None and (job / "selection.parquet").is_file():
+    if key is not None and (job / SELECTION).is_file():
         row, rendered = clip_verdict(job, key), read_receipts(job, "render").get(key)
         reason = row.reason or (rendered and (rendered.reason or rendered.message)) or "it is not packed yet"
         raise DataError(f"{key}: is not in the shards: {reason}; `animatic status {job}` says more")

@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from dataset.layout import RECEIPTS
 from labeling.errors import DataError, StorageError
 
 State = Literal["done", "dropped", "failed"]
@@ -161,7 +162,7 @@ class ReceiptLog:
     """One worker's own log of one stage."""
 
     def __init__(self, job: Path, stage: str, *, worker: str | None = None) -> None:
-        self._path = job / "receipts" / stage / f"{worker or worker_name()}.jsonl"
+        self._path = job / RECEIPTS / stage / f"{worker or worker_name()}.jsonl"
 
     def append(self, receipt: Receipt) -> None:
         """Append one line and sync it; a line that cannot be written whole is taken back.
@@ -207,7 +208,7 @@ def read_receipts(job: Path, stage: str) -> dict[str, Receipt]:
         DataError: a whole line is no receipt.
     """
     latest: dict[str, Receipt] = {}
-    for path in sorted((job / "receipts" / stage).glob("*.jsonl")):
+    for path in sorted((job / RECEIPTS / stage).glob("*.jsonl")):
         for receipt in _read_log(path):
             known = latest.get(receipt.item)
             if known is None or (receipt.turn, receipt.state == "done") >= (known.turn, known.state == "done"):

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from dataset.layout import INDEX_NAME, SHARD_INDEX, SHARDS
 from dataset.receipts import storage_errors
 from dataset.tables import SHARD_INDEX_SCHEMA, read_table, table_of, write_table
 from labeling.errors import DataError
@@ -158,10 +159,10 @@ def find_shards(job_or_shards: Path) -> Path:
     Raises:
         DataError: neither holds one.
     """
-    for folder in (job_or_shards, job_or_shards / "shards"):
-        if (folder / "index.parquet").is_file():
+    for folder in (job_or_shards, job_or_shards / SHARDS):
+        if (folder / INDEX_NAME).is_file():
             return folder
-    raise DataError(f"{job_or_shards}: holds no shards/index.parquet; run `animatic label` or `animatic pack` first")
+    raise DataError(f"{job_or_shards}: holds no {SHARD_INDEX}; run `animatic label` or `animatic pack` first")
 
 
 def read_member(folder: Path, row: Member) -> bytes:

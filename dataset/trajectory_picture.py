@@ -1,7 +1,6 @@
 """A clip's trajectory as a picture: from above with where the camera looks, and its speed and yaw rate over time."""
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from dataset.inspection import clip_verdict
+from dataset.layout import SELECTION, parse_run_item
 from dataset.receipts import outputs_present, read_receipts
 from dataset.selection import read_selection
 from dataset.tables import EgoTable, read_ego
@@ -38,7 +38,7 @@ def clip_motion(job: Path, key: str) -> EgoTable:
     """
     row = clip_verdict(job, key)
     # Runs of an earlier selection keep their receipts: those that begin and end with clips kept now come first.
-    kept = [other for other in read_selection(job / "selection.parquet").kept if other.video_id == row.video_id]
+    kept = [other for other in read_selection(job / SELECTION).kept if other.video_id == row.video_id]
     starts, ends = {other.start for other in kept}, {other.end for other in kept}
     runs = sorted(_told_runs(job, row.video_id), key=lambda run: (run[0] in starts) + (run[1] in ends), reverse=True)
     for start, end, path in runs:
@@ -51,9 +51,9 @@ def clip_motion(job: Path, key: str) -> EgoTable:
 def _told_runs(job: Path, video_id: str) -> Iterator[tuple[int, int, Path]]:
     """Start, end and file of a video's runs whose trajectories are done: what a receipt says, not what lies there."""
     for receipt in read_receipts(job, "ego").values():
-        match = re.fullmatch(re.escape(video_id) + r"/run_(\d+)_(\d+)", receipt.item)
-        if match and receipt.state == "done" and outputs_present(job, receipt):
-            yield int(match[1]), int(match[2]), job / receipt.output(".ego.parquet").path
+        video, run = parse_run_item(receipt.item)
+        if video == video_id and receipt.state == "done" and outputs_present(job, receipt):
+            yield run.start, run.end, job / receipt.output(".ego.parquet").path
 
 
 def sliced(ego: EgoTable, start: int, end: int) -> EgoTable:

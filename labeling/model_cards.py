@@ -20,6 +20,8 @@ from labeling.schemas import Category, KeypointSchema, keypoint_schema
 SHIPPED_CARDS = Path(__file__).with_name("models")
 """The folder of the cards that ship, and of the street models' weights."""
 
+DETECTOR_STRIDES = (8, 16, 32)
+"""Pixels between the cells of a YOLOX's levels, in the order of its output."""
 IMAGENET_MEAN = (123.675, 116.28, 103.53)
 IMAGENET_STD = (58.395, 57.12, 57.375)
 """Per channel (R, G, B), in units of 0 to 255."""
@@ -154,7 +156,7 @@ class YoloxCard(ModelCard, frozen=True):
 
     def output_shapes(self) -> dict[str, Dimensions]:
         """One output: a row of box, objectness and class scores per grid cell."""
-        cells = sum((self.input_width // stride) * (self.input_height // stride) for stride in (8, 16, 32))
+        cells = sum((self.input_width // stride) * (self.input_height // stride) for stride in DETECTOR_STRIDES)
         return {"output": (None, cells, 5 + len(self.class_names))}
 
 

@@ -58,7 +58,6 @@ class _Result:
     shown: int
     figures: dict[str, Any]
     cpu_ms: float
-    wall_ms: float
 
 
 def chart(name: str, *, quick: bool = False) -> Chart:
@@ -180,7 +179,7 @@ def _measure(label: Method, clip: KeypointClip) -> _Result:
     if any(label.track_id != UNTRACKED for label in found):
         tracks = track_score(found, clip.truth)
         figures |= {"switches": tracks.switches, "idf1": tracks.idf1, "mota": tracks.mota}
-    return _Result(right=score.right, shown=score.shown, figures=figures, cpu_ms=cpu_ms, wall_ms=wall_ms)
+    return _Result(right=score.right, shown=score.shown, figures=figures, cpu_ms=cpu_ms)
 
 
 def _point(method: str, results: Sequence[_Result], clips: Sequence[KeypointClip]) -> ChartPoint:

@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.markup import escape
 
+from dataset.layout import SELECTION
 from dataset.receipts import Receipt, make_folder
 from dataset.selection import check_split, read_selection
 from labeling.captions import read_caption_table
@@ -15,7 +16,8 @@ from labeling.ego_import import FileClock
 from labeling.errors import ConfigError
 from labeling.extractors import ExtractorChoice, Extractors, choose_extractors
 from labeling.onnx_model import resolve_providers
-from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, with_effort
+from labeling.settings_files import read_yaml
+from pipelines.config import EFFORTS, Config, merged, parse_config, with_effort
 from pipelines.console import ConsoleReporter, counted, print_damaged, print_failures
 from pipelines.damage import damaged_videos
 from pipelines.engine import Engine
@@ -23,7 +25,6 @@ from pipelines.given_tables import read_cameras, read_split
 from pipelines.imports import import_trajectories
 from pipelines.job import Job, open_job, open_or_create
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
-from pipelines.layout import SELECTION
 from pipelines.models import check_models_folder
 from pipelines.nothing_left import clips_packed, why_nothing_is_left
 from pipelines.sources import absolute, find_videos

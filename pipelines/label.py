@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+from dataset.layout import RECEIPTS
 from dataset.receipts import Receipt
 from labeling.errors import StorageError
 from pipelines.engine import Engine
@@ -151,7 +152,7 @@ def _wait_for_parts(job: Job, stage: str, reporter: Reporter, patience_s: float)
 
 def _progress(root: Path) -> tuple[tuple[str, int], ...]:
     """Sizes of all receipt logs: they grow while any part lives."""
-    logs = sorted((root / "receipts").glob("*/*.jsonl"))
+    logs = sorted((root / RECEIPTS).glob("*/*.jsonl"))
     return tuple((str(log.relative_to(root)), log.stat().st_size) for log in logs)
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from dataset.street_labels import StreetObject
 from labeling.labels import Keypoints
 from pipelines.keypoint_errors import MatchedFrame
-from training.street_scores import PCK_SHARE, is_judged
+from training.criteria import PCK_SHARE
+from training.street_scores import is_judged
 
 
 def scored_points(matched: Iterable[MatchedFrame]) -> np.ndarray:

@@ -27,8 +27,8 @@ class StabilityRow:
 
     scenario: str
     method: str
-    figure: float | None
-    """What was measured; None where the method gave no answer and said so."""
+    figure: float
+    """What was measured."""
     unit: str
     bound: str
     """As a person reads it, such as ``<= 0.1``."""
@@ -46,6 +46,13 @@ class StabilityTable:
     rows: tuple[StabilityRow, ...]
     curves: tuple[ReliabilityCurve, ...] = ()
     """Whether scores can be believed, where the stage gives scores; drawn as ``reliability-<stage>.png``."""
+    references: tuple[str, ...] = ()
+    """Methods that stand beside ours for comparison; where they fail, nothing of ours does."""
+
+    @property
+    def failed(self) -> tuple[StabilityRow, ...]:
+        """The rows of our own methods whose bound is not held."""
+        return tuple(row for row in self.rows if row.verdict == "not held" and row.method not in self.references)
 
 
 def judged(
@@ -88,8 +95,9 @@ def run_stability(name: str, *, out: Path, quick: bool = False) -> StabilityTabl
 def write_stability(table: StabilityTable, out: Path) -> None:
     """``stability-<stage>.json`` in the folder ``out``, and where the table has curves ``reliability-<stage>.png``."""
     values = asdict(table)
-    if not table.curves:
-        values.pop("curves")
+    for optional in ("curves", "references"):
+        if not values[optional]:
+            values.pop(optional)
     text = json.dumps(values, indent=1, ensure_ascii=False) + "\n"
     atomic_write(out / f"stability-{table.stage}.json", text.encode())
     if table.curves:
@@ -114,6 +122,8 @@ def read_stability(path: Path) -> StabilityTable:
     return StabilityTable(**values, rows=rows, curves=curves)
 
 
-def make_table(stage: str, data: str, rows: Sequence[StabilityRow]) -> StabilityTable:
+def make_table(
+    stage: str, data: str, rows: Sequence[StabilityRow], *, references: tuple[str, ...] = ()
+) -> StabilityTable:
     """A table measured on this machine."""
-    return StabilityTable(stage=stage, data=data, machine=machine_name(), rows=tuple(rows))
+    return StabilityTable(stage=stage, data=data, machine=machine_name(), rows=tuple(rows), references=references)

@@ -17,7 +17,7 @@ from labeling.encoding import EncoderSettings
 from labeling.extraction import Effort
 from labeling.labels import Keypoints
 from pipelines.keypoint_clips import HELD_OUT_SEED, KeypointClip, street_frames
-from pipelines.keypoint_errors import MatchedFrame, match_frames, phantom_frames, point_score, recall
+from pipelines.keypoint_errors import MatchedFrame, match_frames, phantom_frames, point_score, recall, track_spans
 from pipelines.keypoint_harm import (
     Board,
     behind_board,
@@ -31,13 +31,13 @@ from pipelines.reliability import NEAR_NINE, PointKind, reliability_curve, share
 from pipelines.scored_points import scored_points
 from pipelines.stability import StabilityRow, StabilityTable, judged, make_table
 from pipelines.track_errors import track_score
+from training.criteria import HIDDEN_SCORE, JUDGED_SHARE
 
 EFFORTS: tuple[Effort, ...] = ("balanced", "exact")
 _SCENES: tuple[Scenario, ...] = ("traffic", "drive", "parked", "stop_and_go")
 _STREETS, _FRAMES, _START = 12, 32, 24
 """Three streets of each scene: one street is a few cars' luck, and a phantom counts for as many frames as it lasts."""
 _EMPTY_FPS = 8
-_HIDDEN_SCORE = 0.3
 _SIZES: dict[int, tuple[float, float]] = {48: (40.0, 57.0), 24: (20.0, 28.5), 12: (10.0, 14.2)}
 """Heights in pixels that are taken for 48, 24 and 12: within a fifth."""
 
@@ -206,7 +206,7 @@ def hidden_below(frames: Iterable[MatchedFrame]) -> tuple[float, int]:
         if label is not None
     ]
     pooled = np.concatenate([np.zeros(0), *scores])
-    return float((pooled < _HIDDEN_SCORE).mean()) if len(pooled) else float("nan"), len(pooled)
+    return float((pooled < HIDDEN_SCORE).mean()) if len(pooled) else float("nan"), len(pooled)
 
 
 def _small_cars(clean: list[list[MatchedFrame]], effort: Effort) -> list[StabilityRow]:
@@ -254,7 +254,7 @@ def column_passages(clip: KeypointClip) -> dict[int, int | None]:
     seen: dict[int, list[int]] = {}
     for frame, things in enumerate(clip.truth):
         for thing in things:
-            if thing.category == "person" and thing.visible_share > 0.3:
+            if thing.category == "person" and thing.visible_share > JUDGED_SHARE:
                 seen.setdefault(thing.track_id, []).append(frame)
     gaps = {
         track: [b for a, b in zip(frames[:-1], frames[1:], strict=True) if b - a > 6] for track, frames in seen.items()
@@ -322,15 +322,12 @@ def drift_shares(labels: Iterable[Keypoints], *, first: int, last: int) -> list[
 
 def _empty_road(effort: Effort) -> list[StabilityRow]:
     """A minute of a road without anybody, rendered as it is looked at: 3 GB of frames are not kept."""
-    labels = label_clip(empty_road(), effort=effort)
-    shown: dict[int, list[int]] = {}
-    for label in labels:
-        shown.setdefault(label.track_id, []).append(label.frame)
-    longest = max((max(frames) - min(frames) + 1 for frames in shown.values()), default=0)
+    phantoms = track_spans(label_clip(empty_road(), effort=effort))
+    longest = max(phantoms.values(), default=0)
     return [
         judged(
             "an empty road, 1 min", longest / 24, unit="s, the longest phantom", at_most=0.25, method=effort,
-            note=f"{len(shown)} phantom tracks; filmed at {_EMPTY_FPS} fps",
+            note=f"{len(phantoms)} phantom tracks; filmed at {_EMPTY_FPS} fps",
         )
     ]  # fmt: skip
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dataset.layout import parse_run_item, run_path
 from dataset.receipts import digest
 from dataset.tables import read_frames_table, write_keypoints
 from labeling.errors import DataError
@@ -16,7 +17,6 @@ from labeling.timeline import RunFrames
 from labeling.video import read_frames
 from pipelines.config import KeypointSettings
 from pipelines.job import Job
-from pipelines.layout import parse_run_item, run_path
 from pipelines.stage import WorkItem
 from pipelines.stages_select import job_extractors, model_hashes
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dataset.layout import INDEX_NAME, SHARD_INDEX, SHARDS, clip_path, index_path, parse_run_item, run_path, shard_path
 from dataset.receipts import Output, digest
 from dataset.selection import ClipRow
 from dataset.shards import (
@@ -28,7 +29,6 @@ from labeling.labels import Keypoints
 from labeling.timeline import FPS, RunFrames, Span, copy_clip
 from pipelines.config import PictureSettings
 from pipelines.job import Job
-from pipelines.layout import SHARD_INDEX, clip_path, index_path, parse_run_item, run_path, shard_path
 from pipelines.stage import NotReadyError, WorkItem
 from pipelines.stages_source import job_selection, picture_map
 from pipelines.stages_views import clip_labels, clip_trajectory, find_run
@@ -111,8 +111,8 @@ class ShardIndexStage:
         rows: list[Member] = []
         for name in item.inputs:
             rows += read_shard_index(root / _rows_path(name))
-        write_shard_index(staging / "index.parquet", rows)
-        for path in (root / "shards").glob("*.tar"):
+        write_shard_index(staging / INDEX_NAME, rows)
+        for path in (root / SHARDS).glob("*.tar"):
             if path.name not in item.inputs:
                 path.unlink(missing_ok=True)
                 (root / _rows_path(path.name)).unlink(missing_ok=True)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from labeling.errors import ConfigError, StorageError
+from pipelines import stability_ego
 from pipelines.charts import (
     CHARTS,
     Chart,
@@ -25,6 +26,7 @@ from pipelines.charts import (
     write_chart,
 )
 from pipelines.label_placing import crossing, place_labels
+from pipelines.measure import show_stability
 from pipelines.stability import STABILITY, judged, make_table, run_stability, write_stability
 
 
@@ -182,6 +184,21 @@ def test_every_name_has_a_module_that_can_be_run(table: dict[str, str], called: 
         spec = find_spec(module)
         assert spec is not None and spec.origin is not None, module
         assert f"\ndef {called}(" in Path(spec.origin).read_text(), module
+
+
+@pytest.mark.parametrize(
+    ("method", "code"), [("default", 1), ("stock OpenCV", 0)], ids=["our own fails", "a reference fails"]
+)
+def test_only_our_own_methods_fail_the_command(
+    method: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [judged("night", figure, unit="m", at_most=3, method=name) for name, figure in (("default", 2), (method, 4))]
+    table = make_table("ego", "a street", rows, references=("stock OpenCV",))
+    monkeypatch.setattr(stability_ego, "stability", lambda *, quick: table)
+    assert show_stability("ego", out=tmp_path) == code
+    assert "not held" in capsys.readouterr().out, "every row stays in the table"
+    written = json.loads((tmp_path / "stability-ego.json").read_text())
+    assert written["references"] == ["stock OpenCV"] and len(written["rows"]) == 2
 
 
 def test_unknown_names_list_the_known(tmp_path: Path) -> None:

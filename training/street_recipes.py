@@ -7,7 +7,9 @@ from typing import Any, Literal, get_args
 import torch
 from torch import nn
 
+from labeling.detection import grid_cells
 from labeling.model_cards import CifcafCard, FieldHeadCard, ModelCard, SimccCard, YoloxCard
+from training.criteria import JUDGED_HEIGHT_PX
 from training.street_augment import AugmentSettings
 from training.street_batches import (
     CLASSES,
@@ -29,9 +31,7 @@ from training.street_networks import (
     SimccNetwork,
 )
 from training.street_pool import PICTURE_SCALE, PICTURE_SIZE, StreetPool
-from training.street_scores import JUDGED_HEIGHT_PX
 from training.street_second_look import OBJECTS, TwoLookDetector, TwoLookGraph
-from training.street_targets import grid_cells
 
 ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_fields"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
