@@ -6,6 +6,7 @@ staged, checked, synced and renamed; so a job that is killed anywhere and starte
 
 import contextlib
 import errno
+import functools
 import hashlib
 import json
 import os
@@ -16,7 +17,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from labeling.errors import DataError, StorageError
 
@@ -24,6 +25,13 @@ State = Literal["done", "dropped", "failed"]
 
 _STORAGE_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.ENOTDIR, errno.EACCES, errno.EPERM,
                    errno.EIO, errno.ESTALE, errno.ENAMETOOLONG, errno.EEXIST, errno.EISDIR}  # fmt: skip
+
+
+class AlteredError(DataError):
+    """A file that is not as its receipt says. Once it is removed it is made again, and then what failed by it."""
+
+    reason: ClassVar[str] = "altered"
+    retryable: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -265,6 +273,29 @@ def outputs_present(job: Path, receipt: Receipt) -> bool:
         except OSError:
             return False
     return True
+
+
+def check_unaltered(path: Path, sha256: str) -> None:
+    """That a file still has the content that its receipt names: sizes alone do not tell what a bad disk did to it.
+
+    It costs one reading of the file in each process that uses it, which will read it anyway: a gigabyte a second or so.
+
+    Raises:
+        AlteredError: it has another content.
+        OSError: it cannot be read.
+    """
+    status = path.stat()
+    found = _sha256_of(path, status.st_size, status.st_mtime_ns)
+    if found != sha256:
+        raise AlteredError(
+            f"{path}: was altered or damaged after it was made (its sha256 is {found[:12]}..., its receipt says "
+            f"{sha256[:12]}...); remove it and run again"
+        )
+
+
+@functools.lru_cache(maxsize=4096)
+def _sha256_of(path: Path, size: int, modified_ns: int) -> str:
+    return sha256_file(path)
 
 
 def atomic_write(path: Path, data: bytes | Iterable[bytes]) -> None:

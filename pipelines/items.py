@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import shutil
 import time
 import traceback
@@ -12,6 +13,7 @@ from dataset.receipts import (
     Output,
     Receipt,
     ReceiptLog,
+    check_unaltered,
     digest,
     host_name,
     make_folder,
@@ -20,6 +22,8 @@ from dataset.receipts import (
 )
 from labeling.errors import AnimaticError, StorageError
 from pipelines.stage import DroppedError, WorkItem, load_stage
+
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +67,10 @@ def _make(root: Path, task: Task, staging: Path, log: ReceiptLog) -> Receipt:
     item = task.item
     shutil.rmtree(staging, ignore_errors=True)
     make_folder(staging)
+    for name, sha256 in files_read(item).items():
+        # One that is not there is for the stage to tell.
+        if (root / name).is_file():
+            check_unaltered(root / name, sha256)
     facts = load_stage(item.stage).work(root, item, staging)
     base = base_receipt(task)
     if task.previous is not None and task.previous.outputs and task.previous.key != item.key:
@@ -74,6 +82,13 @@ def _make(root: Path, task: Task, staging: Path, log: ReceiptLog) -> Receipt:
         base = replace(base, turn=base.turn + 1)
     outputs: tuple[Output, ...] = publish(staging, root, item.outputs)
     return replace(base, outputs=outputs, facts=dict(facts))
+
+
+def files_read(item: WorkItem) -> dict[str, str]:
+    """The job's files among an item's inputs, path to sha256: inputs are called by their paths, or by a name whose path
+    the payload holds."""
+    placed = {item.payload.get(name, name): value for name, value in item.inputs.items() if isinstance(value, str)}
+    return {path: value for path, value in placed.items() if "/" in path and _SHA256.fullmatch(value)}
 
 
 def sweep_staging(root: Path) -> None:
