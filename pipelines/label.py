@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from dataset.receipts import Receipt
+from dataset.receipts import Receipt, check_unaltered
 from labeling.errors import StorageError
 from pipelines.engine import Engine
 from pipelines.items import Task
@@ -73,12 +73,18 @@ def run_stage(
     Raises:
         NotReadyError: the stage waits for another part.
         StorageError: the disk is full; what was made so far is kept.
+        AlteredError: the selection, or the shards' index, is not as it was written.
     """
     started = time.perf_counter()
     known = job.receipts(stage)
     items = [item for item in job.plan(stage) if part is None or not item.owner or part.owns(item.owner)]
     todo = [item for item in items if force or item_state(item, known.get(item.name), job.root) != "current"]
     names = {item.name: item for item in todo}
+    for item in items:
+        # Tables of the whole job are read by later plans and by other commands, where no item compares them.
+        if not item.owner and item.name not in names:
+            for output in known[item.name].outputs:
+                check_unaltered(job.root / output.path, output.sha256)
     report = StageReport(stage=stage, current=len(items) - len(todo))
     report.failed = [
         known[item.name] for item in items if item.name not in names and known[item.name].state == "failed"

@@ -18,7 +18,7 @@ import pytest
 from pipeline_fixtures import SilentReporter, run_all, small_config, tree, write_detector, write_street
 
 from dataset import receipts
-from dataset.receipts import ReceiptLog, read_receipts, sha256_file
+from dataset.receipts import AlteredError, ReceiptLog, read_receipts, sha256_file
 from labeling.errors import StorageError
 from pipelines import engine, items
 from pipelines.items import files_read
@@ -233,5 +233,19 @@ def test_what_is_made_from_an_altered_file_fails_until_that_file_is_removed(
         assert (receipt.reason, receipt.retryable) == ("altered", True)
         assert str(damaged) in receipt.message and "remove it and run again" in receipt.message
     damaged.unlink()
+    run_all(make_job(root, videos, detector))
+    assert tree(root) == tree(undisturbed.root)
+
+
+@pytest.mark.parametrize("table", ["selection.parquet", "shards/index.parquet"])
+def test_an_altered_table_of_the_whole_job_stops_it_until_it_is_removed(
+    tmp_path: Path, videos: Path, detector: Path, undisturbed: Job, table: str
+) -> None:
+    root = tmp_path / "J"
+    shutil.copytree(undisturbed.root, root)
+    alter(root / table)
+    with pytest.raises(AlteredError, match=f"{table}: was altered or damaged .*; remove it and run again"):
+        run_all(make_job(root, videos, detector))
+    (root / table).unlink()
     run_all(make_job(root, videos, detector))
     assert tree(root) == tree(undisturbed.root)
