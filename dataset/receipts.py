@@ -15,9 +15,9 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 from labeling.errors import DataError, StorageError
 
@@ -227,11 +227,28 @@ def _read_log(path: Path) -> Iterable[Receipt]:
     *whole, _torn = path.read_bytes().split(b"\n")
     for number, line in enumerate(whole, start=1):
         try:
-            fields = json.loads(line)
-            fields["outputs"] = tuple(Output(**output) for output in fields["outputs"])
-            yield Receipt(**fields)
-        except (ValueError, TypeError, KeyError) as error:
+            yield _receipt(line)
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise DataError(f"{path}:{number}: is no receipt ({error}); move the line away and run again") from error
+
+
+_KINDS: dict[str, type | tuple[type, ...]] = {
+    "turn": int, "size": int, "retryable": bool, "seconds": (int, float), "outputs": tuple, "facts": dict
+}  # fmt: skip
+"""Types of a record's fields; the others are texts."""
+
+
+def _receipt(line: bytes) -> Receipt:
+    values = json.loads(line)
+    receipt = Receipt(**{**values, "outputs": tuple(Output(**output) for output in values["outputs"])})
+    for record in (receipt, *receipt.outputs):
+        for name in (one.name for one in fields(record)):
+            value = getattr(record, name)
+            if not isinstance(value, _KINDS.get(name, str)):
+                raise TypeError(f"{name} is {value!r}")
+    if receipt.state not in get_args(State):
+        raise ValueError(f"state is {receipt.state!r}")
+    return receipt
 
 
 def publish(staging: Path, job: Path, names: Sequence[str]) -> tuple[Output, ...]:

@@ -23,6 +23,7 @@ from dataset.receipts import (
 from labeling.errors import AnimaticError, StorageError
 from pipelines.stage import DroppedError, WorkItem, load_stage
 
+_PROCESS = re.compile(r"[0-9]{1,9}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -95,7 +96,8 @@ def sweep_staging(root: Path) -> None:
     """Remove what dead processes of this host left half-made; other hosts' process numbers may live, so theirs stay."""
     for folder in (root / ".staging").glob("*"):
         host, _, process = folder.name.rpartition(".")[2].rpartition("-")
-        if host == host_name() and not _alive(int(process)):
+        # A folder that somebody else called otherwise is not ours to remove.
+        if host == host_name() and _PROCESS.fullmatch(process) and not _alive(int(process)):
             shutil.rmtree(folder, ignore_errors=True)
     with contextlib.suppress(OSError):
         (root / ".staging").rmdir()
