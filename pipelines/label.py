@@ -72,7 +72,7 @@ def run_stage(
 
     Raises:
         NotReadyError: the stage waits for another part.
-        StorageError: the disk is full; what was made so far is kept.
+        StorageError: the disk is full, or nothing of the stage could be written; what was made so far is kept.
         AlteredError: the selection, or the shards' index, is not as it was written.
     """
     started = time.perf_counter()
@@ -99,10 +99,19 @@ def run_stage(
     report.seconds = time.perf_counter() - started
     job.refresh()
     reporter.stage_finished(report)
+    lacking = _unwritten(report)
     if len(report.made) < len(todo):
-        full = next(receipt for receipt in report.failed if receipt.reason == StorageError.reason)
-        raise StorageError(f"{full.message} ({stage} stopped with {len(todo) - len(report.made)} items to go)")
+        raise StorageError(f"{lacking[0].message} ({stage} stopped with {len(todo) - len(report.made)} items to go)")
+    if lacking and len(lacking) == len(items):
+        # What comes after would pack nothing, and give another reason for it.
+        raise StorageError(f"{lacking[0].message} ({stage} could write nothing)")
     return report
+
+
+def _unwritten(*reports: StageReport) -> list[Receipt]:
+    """What failed in this call because it could not be written."""
+    made = (receipt for report in reports for receipt in report.made)
+    return [receipt for receipt in made if receipt.state == "failed" and receipt.reason == StorageError.reason]
 
 
 def run_stages(
@@ -128,11 +137,19 @@ def run_stages(
 
     Raises:
         NotReadyError: the other parts made no progress for ``patience_s``.
-        StorageError: the disk is full.
+        StorageError: the disk is full, or a stage waits for what could not be written.
     """
-    reports = []
+    reports: list[StageReport] = []
     for stage in stages:
-        _wait_for_parts(job, stage, reporter, patience_s if part is not None and part.count > 1 else 0.0)
+        lacking = _unwritten(*reports)
+        patient = part is not None and part.count > 1 and not lacking
+        try:
+            _wait_for_parts(job, stage, reporter, patience_s if patient else 0.0)
+        except NotReadyError as error:
+            if not lacking:
+                raise
+            # Not even the receipts of these may have been written: no other part is to blame.
+            raise StorageError(f"{lacking[0].message} ({stage} waits for {len(lacking)} that failed)") from error
         reports.append(run_stage(job, stage, engine, reporter, part=part, force=refreeze and stage == "select"))
     return reports
 

@@ -25,7 +25,7 @@ from pipelines.items import files_read
 from pipelines.job import Job
 from pipelines.label import StageReport, run_stages
 from pipelines.sources import find_videos
-from pipelines.stage import STAGES, NotReadyError
+from pipelines.stage import STAGES
 
 MOMENTS = ("outputs made, none published", "outputs published, no receipt", "receipt torn")
 
@@ -134,7 +134,7 @@ def run_with_small_files(job: Job, limit: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     try:
         _, reports = run_all(job)
-    except (StorageError, NotReadyError):
+    except StorageError:
         os._exit(3)
     failures = [receipt for report in reports for receipt in report.failed]
     os._exit(3 if failures and all(f.reason == "storage" and f.retryable for f in failures) else 4)
