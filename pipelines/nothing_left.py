@@ -3,11 +3,11 @@
 from pathlib import Path
 
 from dataset.inspection import drop_reasons
+from dataset.layout import SELECTION
 from dataset.receipts import Receipt, reason_counts
 from dataset.selection import read_selection
 from labeling.errors import AnimaticError, StorageError
 from pipelines.job import Job, open_job
-from pipelines.layout import SELECTION
 from pipelines.stage import STAGES
 
 _MOST_REASONS = 3
