@@ -228,6 +228,20 @@ def test_what_is_missing_or_wrong_is_named(generator, adapters, tmp_path: Path, 
         generate(image=IMAGE, caption="x", out=tmp_path, **two_stages(adapters))
 
 
+def test_a_sample_that_overflows_is_said_and_not_decoded(generator, tmp_path: Path, monkeypatch) -> None:
+    sample = generator.backbone.sample
+
+    def overflown(*arguments: Any, **named: Any) -> torch.Tensor:
+        latents = sample(*arguments, **named).half() * 60000
+        return latents.float()
+
+    monkeypatch.setattr(generator.backbone, "sample", overflown)
+    conditions = ClipConditions(image=IMAGE, caption="x", first_control=SKELETON)
+    with pytest.raises(ModelError, match=r"motion stage drew latents of which .*% are not finite.*float32"):
+        write_samples(generator, conditions, out=tmp_path, name="a", settings=FAST)
+    assert not list(tmp_path.rglob("*.mp4"))
+
+
 @pytest.mark.parametrize("slots", [("motion", "appearance"), ("motion", "end_to_end"), ("end_to_end", "motion")])
 def test_an_adapter_of_another_stage_is_refused_by_name(adapters, tmp_path: Path, slots: tuple[Stage, Stage]) -> None:
     given, slot = slots

@@ -168,12 +168,13 @@ def read_adapter(path: Path) -> AdapterFile:
 
     Raises:
         ModelError: missing, not safetensors, without a LoRA in it, or one of a kind that would act at another scale:
-            rank-stabilised, DoRA, alphas that differ from module to module.
+            rank-stabilised, DoRA, alphas that differ from module to module; or with numbers that are not finite.
     """
     path = adapter_file(path)
     with open_adapter(path, framework="pt") as file:
         metadata = file.metadata() or {}
         raw = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    _check_finite(path, raw)
     extra = {key.removeprefix(EXTRA_PREFIX): raw.pop(key) for key in list(raw) if key.startswith(EXTRA_PREFIX)}
     alphas = {float(raw.pop(key)) for key in list(raw) if key.endswith(".alpha")}
     tensors = {_plain_key(key): tensor for key, tensor in raw.items()}
@@ -196,6 +197,16 @@ def read_adapter(path: Path) -> AdapterFile:
     targets = tuple(sorted({key.split(".lora_")[0] for key in tensors}))
     about = notes(metadata)
     return AdapterFile(tensors=tensors, extra=extra, rank=rank, alpha=alpha, targets=targets, about=about)
+
+
+def _check_finite(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
+    """Refuse what would draw black videos without a word."""
+    broken = [key for key, tensor in tensors.items() if not tensor.float().isfinite().all()]
+    if broken:
+        raise ModelError(
+            f"{path} cannot be used: {len(broken)} of its {len(tensors)} tensors hold numbers that are not finite, "
+            f"such as {broken[0]}; take an earlier checkpoint, or train again with a lower optimiser.learning_rate"
+        )
 
 
 def _plain_key(key: str) -> str:
