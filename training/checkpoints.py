@@ -3,19 +3,21 @@
 <out>/checkpoints/step_00000020/  adapter.safetensors  optimiser.safetensors  state.json  manifest.json
 """
 
+import contextlib
 import hashlib
 import json
 import os
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import torch
 from safetensors.torch import save_file
 
 from dataset.receipts import make_folder, storage_errors, sync_folder
-from labeling.errors import DataError
+from labeling.errors import DataError, StorageError
+from training.claims import owner, sweep
 
 MANIFEST = "manifest.json"
 
@@ -37,8 +39,8 @@ def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes | dict[str,
     Raises:
         StorageError: no space left, or the folder cannot be written to; earlier checkpoints are untouched.
     """
-    goal, staged = checkpoint_folder(root, step), root / f".step_{step:08d}.{os.getpid()}"
-    with storage_errors(root):
+    goal, staged = checkpoint_folder(root, step), root / f".step_{step:08d}.{owner()}"
+    with _kept_alone(root), storage_errors(root):
         shutil.rmtree(staged, ignore_errors=True)
         make_folder(staged)
         try:
@@ -56,6 +58,18 @@ def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes | dict[str,
             shutil.rmtree(staged, ignore_errors=True)
         _prune(root, keep=keep, written=goal)
     return goal
+
+
+@contextlib.contextmanager
+def _kept_alone(root: Path) -> Iterator[None]:
+    """A folder that vanishes while it is written to is another's doing, and no fault of ours."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise StorageError(
+            f"{root}: {error.filename} was taken away while a checkpoint was written; let nothing else change that "
+            "folder, and run the command again"
+        ) from error
 
 
 def _write_synced(path: Path, data: bytes | dict[str, torch.Tensor]) -> None:
@@ -78,8 +92,7 @@ def _prune(root: Path, *, keep: int, written: Path) -> None:
     others = [path for path in list_checkpoints(root) if path != written]
     for path in others[: max(0, len(others) + 1 - keep)]:
         shutil.rmtree(path, ignore_errors=True)
-    for leftover in root.glob(".step_*"):
-        shutil.rmtree(leftover, ignore_errors=True)
+    sweep(root.glob(".step_*"))
 
 
 def list_checkpoints(root: Path) -> list[Path]:

@@ -25,6 +25,7 @@ from training.backbone import Backbone
 from training.backbones import load_backbone
 from training.batches import StepBatches, TrainingBatch, TrainingItems, collate
 from training.checkpoints import check_checkpoint, newest_checkpoint, save_checkpoint
+from training.claims import Claim
 from training.config import TrainConfig
 from training.draws import keyed_seed
 from training.dry_run import RunPlan, plan_run
@@ -87,7 +88,7 @@ def train(
         quiet: no progress line.
 
     Raises:
-        ConfigError: settings that contradict each other or the checkpoint.
+        ConfigError: settings that contradict each other or the checkpoint, or another training that uses ``out``.
         DataError: no latents, stale latents.
         StorageError: no space left, or ``out`` cannot be written to.
         TrainingError: a loss that is no number, no memory left; the last good checkpoint is intact.
@@ -107,6 +108,21 @@ class Trainer:
         self.config, self.out, self.quiet = config, out, quiet
         self.accelerator = _accelerator(config, out)
         self.store = _fitting_store(config, data)
+        # One process writes for all.
+        self.claim = Claim(out) if self.accelerator.is_main_process else None
+        try:
+            self._prepare(resume, backbone)
+        except BaseException:
+            self._release()
+            raise
+
+    def _release(self) -> None:
+        if self.claim is not None:
+            self.claim.release()
+
+    def _prepare(self, resume: Resume, backbone: Backbone | None) -> None:
+        """Load the backbone and put it where the run stands."""
+        config = self.config
         self.backbone = backbone or load_backbone(config.backbone, device=self.accelerator.device)
         if self.accelerator.is_main_process:
             check_store(self.store, config.backbone, vae_fingerprint=self.backbone.fingerprint_vae())
@@ -165,7 +181,13 @@ class Trainer:
         )  # fmt: skip
 
     def run(self, on_step: Callable[[int, float], None] | None = None) -> TrainSummary:
-        """Train to the last step, or until Ctrl-C."""
+        """Train to the last step, or until Ctrl-C, and give ``out`` free."""
+        try:
+            return self._run(on_step)
+        finally:
+            self._release()
+
+    def _run(self, on_step: Callable[[int, float], None] | None) -> TrainSummary:
         config, start = self.config, self.step
         losses: list[float] = []
         held_out: dict[str, float] = {}
