@@ -129,7 +129,8 @@ class Trainer:
             self.backbone.release(["vae"])
         self.keys = self.store.keys("train")
         self.items = TrainingItems(self.store, self.keys, config)
-        self.parameters = attach_for_training(self.backbone, config)
+        with memory_advice(config):
+            self.parameters = attach_for_training(self.backbone, config)
         self.names = [name for name, one in self.backbone.denoiser.named_parameters() if one.requires_grad]
         self.optimiser = torch.optim.AdamW(
             self.parameters, lr=config.optimiser.learning_rate, betas=config.optimiser.betas,
