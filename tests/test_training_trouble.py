@@ -1,6 +1,9 @@
 """What a training leaves to others: two in one folder, kills between two writes, records that were damaged."""
 
+import hashlib
+import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,10 +11,15 @@ from typing import Any
 import pytest
 from training_fixtures import in_children, one_thread, tiny_config, tiny_job  # noqa: F401
 
-from labeling.errors import ConfigError, StorageError
+from labeling.errors import AnimaticError, ConfigError, DataError, ModelError, StorageError
+from training.adapter_notes import read_about, read_progress
+from training.adapters import read_adapter
 from training.checkpoints import list_checkpoints, newest_checkpoint, save_checkpoint
-from training.run_log import read_metrics
-from training.trainer import train
+from training.config import TrainConfig
+from training.latent_store import LatentStore
+from training.run_log import METRICS, read_metrics
+from training.run_state import FILES, read_state
+from training.trainer import TrainSummary, train
 
 
 def refusal(call: Callable[[], Any]) -> str:
@@ -82,8 +90,6 @@ def test_saving_sweeps_what_the_dead_left_and_nothing_of_the_living(tmp_path: Pa
 
 
 def test_a_staging_folder_that_vanishes_is_a_storage_error(tmp_path: Path, monkeypatch) -> None:
-    import shutil
-
     from training import checkpoints
 
     digest = checkpoints._digest
@@ -91,3 +97,141 @@ def test_a_staging_folder_that_vanishes_is_a_storage_error(tmp_path: Path, monke
     with pytest.raises(StorageError, match="taken away while a checkpoint was written"):
         save_checkpoint(tmp_path, 1, {"a": b"x"}, keep=1)
     assert list_checkpoints(tmp_path) == []
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_job: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
+    """A run of two steps with a checkpoint of each; read it, do not write to it."""
+    out = tmp_path_factory.mktemp("finished") / "run"
+    train(two_steps(), data=tiny_job, out=out, quiet=True)
+    return out
+
+
+def two_steps() -> TrainConfig:
+    return tiny_config("motion", optimiser={"steps": 2}, checkpoint={"every_steps": 1, "keep": 2})
+
+
+def resumed(job: Path, out: Path) -> int:
+    """The step that a run went on from."""
+    summary = train(two_steps(), data=job, out=out, quiet=True)
+    assert isinstance(summary, TrainSummary)
+    return summary.started_at
+
+
+@pytest.mark.parametrize(
+    "damage", [b"garbage\n", b'{"a": 1}\n', b'{"step": "x"}\n', b"\xff\xfe\n", b"[1]\n"],
+    ids=["garbage", "no step", "step of text", "not UTF-8", "list"],
+)  # fmt: skip
+def test_damaged_lines_of_the_metrics_do_not_stop_a_resume(
+    damage: bytes, tiny_job: Path, finished: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
+    out = shutil.copytree(finished, tmp_path / "run")
+    (out / METRICS).write_bytes(damage + (out / METRICS).read_bytes())
+    with pytest.warns(UserWarning, match=rf"leaving out {out / METRICS}:1, which tells no step"):
+        assert resumed(tiny_job, out) == 2
+    assert (out / METRICS).read_bytes() == (finished / METRICS).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "line", [b"garbage", b"\xff\xfe", b"[1]", b'{"key": "a"}', b'{"key": ["a"], "split": "train"}'],
+    ids=["garbage", "not UTF-8", "list", "lacking", "key of another kind"],
+)  # fmt: skip
+def test_a_damaged_record_of_latents_is_named_with_its_line(line: bytes, tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    store = shutil.copytree(tiny_job / "latents" / "tiny", tmp_path / "tiny")
+    (log,) = store.glob("clips-*.jsonl")
+    first, _, rest = log.read_bytes().partition(b"\n")
+    log.write_bytes(first + b"\n" + line + b"\n" + rest)
+    with pytest.raises(DataError, match=rf"{log}:2: is no record .*take the line away and run `animatic cache`"):
+        LatentStore(store)
+    log.write_bytes(first + b"\n" + rest + line)
+    assert LatentStore(store).keys("train") == LatentStore(tiny_job / "latents" / "tiny").keys("train"), "a torn end"
+
+
+@pytest.mark.parametrize(
+    "change", [{"parts": []}, {"frames": "x"}, {"fps": None}, {"backbone": 3}, None], ids=str
+)  # fmt: skip
+def test_a_manifest_of_latents_with_values_of_another_kind_is_named(
+    change: dict | None, tiny_job: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
+    store = shutil.copytree(tiny_job / "latents" / "tiny", tmp_path / "tiny")
+    tree = json.loads((store / "cache.json").read_text())
+    (store / "cache.json").write_text(json.dumps([] if change is None else tree | change))
+    with pytest.raises(DataError, match="cache.json is no manifest of latents .*cache again"):
+        LatentStore(store)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        ({"animatic": "{"}, "'animatic' is no JSON object"),
+        ({"animatic": "[1]"}, "'animatic' is no JSON object"),
+        ({"animatic": '{"config": []}'}, "'animatic' holds no settings of a training"),
+        ({"animatic": '{"config": {"optimiser": 3}}'}, "'animatic' holds no settings of a training"),
+        ({"animatic": '{"stage": ["motion"]}'}, "'animatic' holds no settings of a training"),
+        ({"lora_adapter_metadata": "{"}, "'lora_adapter_metadata' is no JSON object"),
+        ({"lora_adapter_metadata": "[1]"}, "'lora_adapter_metadata' is no JSON object"),
+        ({"lora_adapter_metadata": '{"a.lora_alpha": "x"}'}, "lora_alpha is 'x', but must be a finite number"),
+        ({"lora_adapter_metadata": '{"a.lora_alpha": NaN}'}, "lora_alpha is nan, but must be a finite number"),
+    ],
+    ids=lambda value: str(value) if isinstance(value, dict) else "",
+)
+def test_damaged_metadata_of_an_adapter_is_named(
+    metadata: dict[str, str], message: str, finished: Path, tmp_path: Path
+) -> None:
+    from safetensors.torch import load_file, save_file
+
+    path = tmp_path / "a.safetensors"
+    save_file(load_file(finished / "adapter.safetensors"), path, metadata=metadata)
+    readers: list[Callable[[Path], Any]] = [read_adapter]
+    if "animatic" in metadata:
+        readers += [read_about, read_progress]
+    for read in readers:
+        with pytest.raises(ModelError, match=rf"{path}: .*{message}"):
+            read(path)
+
+
+def listed(checkpoint: Path, name: str, text: str) -> None:
+    """Another content of a checkpoint's file, to which its manifest agrees."""
+    (checkpoint / name).write_text(text)
+    manifest = json.loads((checkpoint / "manifest.json").read_text())
+    manifest["files"][name] = {"size": len(text), "sha256": hashlib.sha256(text.encode()).hexdigest()}
+    (checkpoint / "manifest.json").write_text(json.dumps(manifest))
+
+
+@pytest.mark.parametrize(
+    "files", [{"adapter.safetensors": 3}, {}, [1], None, {"state.json": {"size": 1}}], ids=str
+)  # fmt: skip
+def test_a_checkpoint_whose_manifest_does_not_list_it_is_skipped(
+    files: Any, tiny_job: Path, finished: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
+    out = shutil.copytree(finished, tmp_path / "run")
+    newest = out / "checkpoints" / "step_00000002"
+    (newest / "manifest.json").write_text(json.dumps({"step": 2, "files": files}))
+    with pytest.warns(UserWarning, match="skipping a torn checkpoint"):
+        assert resumed(tiny_job, out) == 1
+    assert (out / "adapter.safetensors").read_bytes() == (finished / "adapter.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("state.json", '{"step": 2, "config": []}', "is no run state .config holds no settings by name"),
+        ("state.json", '{"step": 2, "config": {"optimiser": []}}', "is no run state .config holds no settings"),
+        ("state.json", '{"step": -3, "config": {}}', "is no run state .step is -3.*take an earlier checkpoint"),
+        ("state.json", '{"step": "x", "config": {}}', "is no run state .step is 'x'"),
+        ("optimiser.safetensors", "abc", "optimiser.safetensors cannot be read .*take an earlier checkpoint"),
+    ],
+    ids=["list", "section", "negative", "text", "moments"],
+)
+def test_a_state_that_is_none_is_named(
+    name: str, text: str, message: str, tiny_job: Path, finished: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
+    out = shutil.copytree(finished, tmp_path / "run")
+    newest = out / "checkpoints" / "step_00000002"
+    listed(newest, name, text)
+    assert newest_checkpoint(out / "checkpoints", wanted=FILES) == newest
+    with pytest.raises(DataError, match=message):
+        resumed(tiny_job, out)
+    if name == "state.json":
+        with pytest.raises(AnimaticError, match=message):
+            read_state(newest)

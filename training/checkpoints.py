@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 import torch
@@ -100,31 +100,35 @@ def list_checkpoints(root: Path) -> list[Path]:
     return sorted(path for path in root.glob("step_*") if path.is_dir())
 
 
-def check_checkpoint(path: Path) -> int:
-    """The step of a whole checkpoint.
+def check_checkpoint(path: Path, *, wanted: Collection[str] = ()) -> int:
+    """The step of a whole checkpoint, which holds the files that are wanted and all others that its manifest lists.
 
     Raises:
         DataError: a file is missing, cut short or changed.
     """
     try:
         manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-        step, files = int(manifest["step"]), dict(manifest["files"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        step = int(manifest["step"])
+        files = {name: (told["size"], told["sha256"]) for name, told in manifest["files"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path} has no whole manifest ({type(error).__name__}); it was not finished") from error
-    for name, wanted in files.items():
+    unlisted = sorted(set(wanted) - set(files))
+    if unlisted:
+        raise DataError(f"{path}: its manifest does not list {', '.join(unlisted)}; take an earlier checkpoint")
+    for name, (size, digest) in files.items():
         file = path / name
-        if not file.is_file() or file.stat().st_size != wanted["size"]:
+        if not file.is_file() or file.stat().st_size != size:
             raise DataError(f"{path}: {name} is missing or cut short; take an earlier checkpoint")
-        if _digest(file) != wanted["sha256"]:
+        if _digest(file) != digest:
             raise DataError(f"{path}: {name} does not match its manifest; take an earlier checkpoint")
     return step
 
 
-def newest_checkpoint(root: Path) -> Path | None:
+def newest_checkpoint(root: Path, *, wanted: Collection[str] = ()) -> Path | None:
     """The newest whole checkpoint; torn ones are skipped with a warning. None where there is none."""
     for path in reversed(list_checkpoints(root)):
         try:
-            check_checkpoint(path)
+            check_checkpoint(path, wanted=wanted)
         except DataError as error:
             warnings.warn(f"skipping a torn checkpoint: {error}", stacklevel=2)
             continue

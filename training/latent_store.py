@@ -73,6 +73,20 @@ class CacheManifest:
         return json.dumps({"fingerprint": self.fingerprint, **asdict(self)}, sort_keys=True, indent=1) + "\n"
 
 
+_MANIFEST_TYPES = {"parts": dict, "frames": int, "fps": int | float, "backbone": dict}
+_RECORD_TYPES = {"key": str, "split": str, "caption": str, "file": str, "size": int, "source": str, "turn": int}
+
+
+def _of_types(tree: Any, types: Mapping[str, Any]) -> dict[str, Any]:
+    """The named values of a JSON object; TypeError or KeyError where they are absent or of another kind."""
+    if not isinstance(tree, dict):
+        raise TypeError(f"it holds a {type(tree).__name__}")
+    for name, kind in types.items():
+        if not isinstance(tree[name], kind):
+            raise TypeError(f"{name} is {tree[name]!r}")
+    return {name: tree[name] for name in types}
+
+
 def read_manifest(folder: Path) -> CacheManifest | None:
     """The manifest of a store, or None where there is none.
 
@@ -84,7 +98,7 @@ def read_manifest(folder: Path) -> CacheManifest | None:
         return None
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
-        return CacheManifest(**{name: tree[name] for name in ("parts", "frames", "fps", "backbone")})
+        return CacheManifest(**_of_types(tree, _MANIFEST_TYPES))
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} is no manifest of latents ({error}); remove {folder} and cache again") from error
 
@@ -202,13 +216,29 @@ def read_records(folder: Path) -> Sequence[ClipRecord]:
     """The newest record of each clip over all parts, retired ones too; a torn last line is ignored.
 
     Turns tell which is newest, not the order of files: a clip's part changes with the number of parts.
+
+    Raises:
+        DataError: a whole line is no record.
     """
     latest: dict[str, ClipRecord] = {}
     for path in sorted(folder.glob("clips-*.jsonl")):
-        *whole, _torn = path.read_text(encoding="utf-8").split("\n")
-        for line in whole:
-            record = ClipRecord(**json.loads(line))
+        *whole, _torn = path.read_bytes().split(b"\n")
+        for number, line in enumerate(whole, start=1):
+            record = _read_record(path, number, line)
             known = latest.get(record.key)
             if known is None or record.turn >= known.turn:
                 latest[record.key] = record
     return [latest[key] for key in sorted(latest)]
+
+
+def _read_record(path: Path, number: int, line: bytes) -> ClipRecord:
+    try:
+        tree = json.loads(line)
+        # Older records tell no turn.
+        _of_types({"turn": 0, **tree}, _RECORD_TYPES)
+        return ClipRecord(**tree)
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{path}:{number}: is no record of a clip's latents ({error}); take the line away and run `animatic cache` "
+            "again, which makes what is missing"
+        ) from error

@@ -34,7 +34,7 @@ from training.latent_store import LatentStore
 from training.latents import check_store, manifest_picture, open_store, write_whole
 from training.prefetch import Prefetched, leave_signals_to_the_trainer
 from training.run_log import RunLog
-from training.run_state import ADAPTER, RunState, config_differences, pack_state, read_state, restore
+from training.run_state import ADAPTER, FILES, RunState, config_differences, pack_state, read_state, restore
 from training.schedule import learning_rate
 from training.validation import held_out_losses, write_validation_videos
 
@@ -145,12 +145,12 @@ class Trainer:
     def _resume(self, resume: Resume) -> int:
         """Steps done, with the adapter and the moments put back."""
         root = self.out / "checkpoints"
-        checkpoint = newest_checkpoint(root) if isinstance(resume, str) else resume
+        checkpoint = newest_checkpoint(root, wanted=FILES) if isinstance(resume, str) else resume
         if checkpoint is None:
             return 0
         if resume == "never":
             raise ConfigError(f"{self.out} already has checkpoints; give another --out, or --resume auto to go on")
-        check_checkpoint(checkpoint)
+        check_checkpoint(checkpoint, wanted=FILES)
         state = read_state(checkpoint)
         changed = config_differences(state.config, self.config)
         if changed:
