@@ -210,6 +210,37 @@ def test_trajectory_files_are_resampled_and_must_be_long_enough(tmp_path: Path) 
     assert ego_trajectory(tmp_path / "drive.npy", frames=9, fps=24).cam_to_world[-1, 2, 3] == pytest.approx(8)
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"junk", "is no array of camera poses: it is no whole .npy of numbers; give .T, 4, 4. numbers"),
+        (b"", "is no array of camera poses"),
+        (np.array([{}], object), "is no array of camera poses"),
+        (np.float64(3), r"holds float64 \(\), but a trajectory is \(T, 4, 4\)"),
+        (np.array(["a"] * 9), r"holds <U1 \(9,\), but"),
+        (np.zeros((3, 3)), r"holds float64 \(3, 3\), but"),
+        (np.zeros((0, 4, 4)), r"holds float64 \(0, 4, 4\), but"),
+        (np.zeros((9, 4, 4), complex), r"holds complex128 \(9, 4, 4\), but"),
+    ],
+    ids=["junk", "empty", "objects", "scalar", "text", "other shape", "no pose", "complex"],
+)
+def test_arrays_that_are_no_trajectory_are_named(tmp_path: Path, content: Any, message: str) -> None:
+    path = tmp_path / "drive.npy"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.save(path, content, allow_pickle=True)
+    with pytest.raises(ConfigError, match=f"{path} {message}"):
+        ego_trajectory(path, frames=9, fps=24)
+
+
+def test_an_archive_of_arrays_is_no_trajectory(tmp_path: Path) -> None:
+    np.savez(tmp_path / "drive.npz", a=np.zeros((9, 4, 4)))
+    (tmp_path / "drive.npz").rename(tmp_path / "drive.npy")
+    with pytest.raises(ConfigError, match="drive.npy is no array of camera poses"):
+        ego_trajectory(tmp_path / "drive.npy", frames=9, fps=24)
+
+
 def test_what_is_missing_or_wrong_is_named(generator, adapters, tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(ConfigError, match="--motion and --appearance"):
         ClipGenerator(generator.backbone)
