@@ -3,15 +3,17 @@
 import hashlib
 import json
 import os
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from training_fixtures import in_children, one_thread, tiny_config, tiny_job  # noqa: F401
+from training_fixtures import cached_job, in_children, one_thread, tiny_config, tiny_job  # noqa: F401
 
 from labeling.errors import AnimaticError, ConfigError, DataError, ModelError, StorageError
+from training import checkpoints
 from training.adapter_notes import read_about, read_progress
 from training.adapters import read_adapter
 from training.checkpoints import list_checkpoints, newest_checkpoint, save_checkpoint
@@ -90,8 +92,6 @@ def test_saving_sweeps_what_the_dead_left_and_nothing_of_the_living(tmp_path: Pa
 
 
 def test_a_staging_folder_that_vanishes_is_a_storage_error(tmp_path: Path, monkeypatch) -> None:
-    from training import checkpoints
-
     digest = checkpoints._digest
     monkeypatch.setattr(checkpoints, "_digest", lambda path: (digest(path), shutil.rmtree(path.parent))[0])
     with pytest.raises(StorageError, match="taken away while a checkpoint was written"):
@@ -235,3 +235,71 @@ def test_a_state_that_is_none_is_named(
     if name == "state.json":
         with pytest.raises(AnimaticError, match=message):
             read_state(newest)
+
+
+def test_a_start_that_cannot_write_the_metrics_keeps_their_history(
+    tiny_job: Path, finished: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
+    """As a kill while they are written: what was there is there."""
+    out = shutil.copytree(finished, tmp_path / "run")
+
+    def cut_short(_: int) -> str:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))
+        try:
+            resumed(tiny_job, out)
+        except StorageError as error:
+            return str(error)
+        return "it was written"
+
+    (told,) = in_children(1, cut_short)
+    assert "file too large" in told
+    assert (out / METRICS).read_bytes() == (finished / METRICS).read_bytes()
+
+
+@pytest.mark.parametrize("renames", [0, 1, 2])
+def test_a_kill_while_a_step_is_saved_again_leaves_one_whole(tmp_path: Path, monkeypatch, renames: int) -> None:
+    save_checkpoint(tmp_path, 1, {"a": b"first"}, keep=1)
+    rename, done = Path.rename, []
+
+    def killed(path: Path, goal: Path) -> Path:
+        if len(done) == renames:
+            raise KeyboardInterrupt
+        done.append(goal)
+        return rename(path, goal)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", killed)
+        if renames == 2:
+            patch.setattr(checkpoints, "_prune", lambda *_, **__: killed(tmp_path, tmp_path))
+        with pytest.raises(KeyboardInterrupt):
+            save_checkpoint(tmp_path, 1, {"a": b"second"}, keep=1)
+    whole = newest_checkpoint(tmp_path, wanted=["a"])
+    assert whole is not None and (whole / "a").read_bytes() == (b"second" if renames == 2 else b"first")
+    save_checkpoint(tmp_path, 1, {"a": b"third"}, keep=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["step_00000001"]
+    assert (tmp_path / "step_00000001" / "a").read_bytes() == b"third"
+
+
+def test_what_a_kill_left_beside_the_adapter_is_swept(tiny_job: Path, finished: Path, tmp_path: Path) -> None:  # noqa: F811
+    from dataset.receipts import host_name
+
+    out = shutil.copytree(finished, tmp_path / "run")
+    (dead,) = in_children(1, lambda _: os.getpid())
+    kept = {".notes.txt", f".adapter.safetensors.{host_name()}-{os.getppid()}.tmp"}
+    gone = {f".adapter.safetensors.{host_name()}-{dead}.tmp", ".adapter.safetensors.x7_ab2cd"}
+    for name in kept | gone:
+        (out / name).write_bytes(b"half")
+    resumed(tiny_job, out)
+    assert {path.name for path in out.iterdir() if path.name.startswith(".")} == kept
+
+
+def test_what_a_kill_left_among_latents_is_swept(tmp_path: Path) -> None:
+    from dataset.receipts import host_name
+
+    job = cached_job(tmp_path / "job")
+    (clip,) = (job / "latents" / "tiny").rglob("street_0.safetensors")
+    (dead,) = in_children(1, lambda _: os.getpid())
+    half = clip.with_name(f".{clip.name}.{host_name()}-{dead}.tmp")
+    half.write_bytes(b"half")
+    cached_job(job)
+    assert clip.is_file() and not half.exists()

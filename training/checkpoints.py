@@ -20,6 +20,8 @@ from labeling.errors import DataError, StorageError
 from training.claims import owner, sweep
 
 MANIFEST = "manifest.json"
+_ASIDE = ".old"
+"""Of a checkpoint that another of the same step takes the place of: a kill in between leaves one or both."""
 
 
 def checkpoint_folder(root: Path, step: int) -> Path:
@@ -40,6 +42,7 @@ def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes | dict[str,
         StorageError: no space left, or the folder cannot be written to; earlier checkpoints are untouched.
     """
     goal, staged = checkpoint_folder(root, step), root / f".step_{step:08d}.{owner()}"
+    aside = goal.with_suffix(_ASIDE)
     with _kept_alone(root), storage_errors(root):
         shutil.rmtree(staged, ignore_errors=True)
         make_folder(staged)
@@ -51,7 +54,10 @@ def save_checkpoint(root: Path, step: int, files: Mapping[str, bytes | dict[str,
             }
             _write_synced(staged / MANIFEST, json.dumps({"step": step, "files": listed}, sort_keys=True).encode())
             sync_folder(staged)
-            shutil.rmtree(goal, ignore_errors=True)
+            # An earlier one of that step stays until this one is in its place: it may be the only one.
+            if goal.exists():
+                shutil.rmtree(aside, ignore_errors=True)
+                goal.rename(aside)
             staged.rename(goal)
             sync_folder(root)
         finally:
@@ -88,6 +94,8 @@ def _digest(path: Path) -> str:
 
 
 def _prune(root: Path, *, keep: int, written: Path) -> None:
+    for aside in root.glob(f"step_*{_ASIDE}"):
+        shutil.rmtree(aside, ignore_errors=True)
     # A run that went on from an older checkpoint has written one that is not the newest by its step.
     others = [path for path in list_checkpoints(root) if path != written]
     for path in others[: max(0, len(others) + 1 - keep)]:
@@ -97,7 +105,8 @@ def _prune(root: Path, *, keep: int, written: Path) -> None:
 
 def list_checkpoints(root: Path) -> list[Path]:
     """Checkpoint folders by step, oldest first; whether they are whole is not looked at."""
-    return sorted(path for path in root.glob("step_*") if path.is_dir())
+    found = [path for path in root.glob("step_*") if path.is_dir()]
+    return sorted(found, key=lambda path: (path.name.removesuffix(_ASIDE), path.suffix != _ASIDE))
 
 
 def check_checkpoint(path: Path, *, wanted: Collection[str] = ()) -> int:

@@ -13,7 +13,7 @@ from accelerate import Accelerator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dataset.receipts import make_folder, storage_errors
+from dataset.receipts import atomic_write, make_folder, storage_errors
 
 METRICS = "metrics.jsonl"
 
@@ -55,7 +55,7 @@ class RunLog:
             make_folder(out)
             with storage_errors(self._path):
                 kept = [line for line, values in _whole_lines(self._path) if values["step"] <= start]
-                self._path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+                atomic_write(self._path, "".join(f"{line}\n" for line in kept).encode())
 
     def __enter__(self) -> "RunLog":
         self._progress.start()

@@ -17,7 +17,7 @@ from accelerate.tracking import get_available_trackers
 from accelerate.utils import LoggerType
 from torch.utils.data import DataLoader
 
-from dataset.receipts import make_folder, storage_errors
+from dataset.receipts import atomic_write, make_folder, storage_errors
 from labeling.errors import ConfigError, DataError
 from training.adapters import trainable_count
 from training.attachment import attach_for_training
@@ -25,15 +25,15 @@ from training.backbone import Backbone
 from training.backbones import load_backbone
 from training.batches import StepBatches, TrainingBatch, TrainingItems, collate
 from training.checkpoints import check_checkpoint, newest_checkpoint, save_checkpoint
-from training.claims import Claim
+from training.claims import Claim, sweep
 from training.config import TrainConfig
 from training.draws import keyed_seed
 from training.dry_run import RunPlan, plan_run
 from training.guards import StopFlag, TrainingError, memory_advice, stop_flag
 from training.latent_store import LatentStore
-from training.latents import check_store, manifest_picture, open_store, write_whole
+from training.latents import check_store, manifest_picture, open_store
 from training.prefetch import Prefetched, leave_signals_to_the_trainer
-from training.run_log import RunLog
+from training.run_log import METRICS, RunLog
 from training.run_state import ADAPTER, FILES, RunState, config_differences, pack_state, read_state, restore
 from training.schedule import learning_rate
 from training.validation import held_out_losses, write_validation_videos
@@ -123,6 +123,8 @@ class Trainer:
     def _prepare(self, resume: Resume, backbone: Backbone | None) -> None:
         """Load the backbone and put it where the run stands."""
         config = self.config
+        if self.claim is not None:
+            sweep(half for name in (ADAPTER, METRICS) for half in self.out.glob(f".{name}.*"))
         self.backbone = backbone or load_backbone(config.backbone, device=self.accelerator.device)
         if self.accelerator.is_main_process:
             check_store(self.store, config.backbone, vae_fingerprint=self.backbone.fingerprint_vae())
@@ -286,8 +288,7 @@ class Trainer:
         save_checkpoint(self.out / "checkpoints", self.step, files, keep=self.config.checkpoint.keep)
         adapter = files[ADAPTER]
         assert isinstance(adapter, bytes)
-        with storage_errors(self.out):
-            write_whole(self.out / ADAPTER, adapter)
+        atomic_write(self.out / ADAPTER, adapter)
 
     def _validate(self, log: RunLog) -> dict[str, float]:
         values = held_out_losses(self.backbone, self.items, self.store, self.config, accelerator=self.accelerator)
