@@ -303,3 +303,38 @@ def test_what_a_kill_left_among_latents_is_swept(tmp_path: Path) -> None:
     half.write_bytes(b"half")
     cached_job(job)
     assert clip.is_file() and not half.exists()
+
+
+@pytest.mark.parametrize("trackers", [[], ["tensorboard"]], ids=["metrics alone", "tensorboard"])
+@pytest.mark.parametrize("cause", ["no job", "no clips of it", "weights"])
+def test_a_training_that_is_refused_makes_nothing(
+    cause: str, trackers: list[str], tiny_job: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
+    job = tmp_path / "Q5"
+    if cause == "no clips of it":
+        job.mkdir()
+    if cause == "weights":
+        shutil.copytree(tiny_job / "latents" / "tiny", job / "latents" / "tiny")
+    before = sorted(tmp_path.rglob("*"))
+    config = tiny_config("motion", trackers=trackers)
+    if cause == "weights":
+        absent = config.backbone.model_copy(update={"weights": "none/there"})
+        config = config.model_copy(update={"backbone": absent})
+    with pytest.raises(AnimaticError):
+        train(config, data=job, out=job / "adapters" / "tiny_motion", quiet=True)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_missing_latents_are_told_with_the_command_that_makes_them(tmp_path: Path) -> None:
+    words = r"is no job: .* label .*`animatic cache .*--backbone tiny`"
+    with pytest.raises(DataError, match=f"Q5 {words}"):
+        LatentStore(tmp_path / "Q5" / "latents" / "tiny")
+    job = tmp_path / "not yet"
+    job.mkdir()
+    with pytest.raises(DataError, match=f"not yet {words}"):
+        LatentStore(job / "latents" / "tiny")
+    (job / "shards").mkdir()
+    with pytest.raises(DataError, match=r"no latents for backbone tiny; .* cache '.*/not yet' --backbone tiny`"):
+        LatentStore(job / "latents" / "tiny")
+    with pytest.raises(DataError, match=r"for backbone mine; .* --backbone FILE`, FILE being the YAML that says what"):
+        LatentStore(job / "latents" / "mine")

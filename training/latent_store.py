@@ -9,6 +9,7 @@ latents/<backbone>/cache.json             fingerprint, its parts, sizes
 import functools
 import hashlib
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 
 from labeling.errors import DataError
 from training.backbone import TextEmbedding
+from training.config import BACKBONES
 from training.stages import OBJECTS
 
 MANIFEST = "cache.json"
@@ -130,7 +132,7 @@ class LatentStore:
         self.folder = Path(folder)
         manifest = read_manifest(self.folder)
         if manifest is None:
-            raise DataError(f"{self.folder} holds no latents; make them with `animatic cache JOB --backbone NAME`")
+            raise DataError(_none_there(self.folder))
         self.manifest = manifest
         self._records = {record.key: record for record in read_records(self.folder) if not record.retired}
 
@@ -194,6 +196,19 @@ class LatentStore:
             DataError: it was not.
         """
         return _read_text(self.folder, caption)
+
+
+def _none_there(folder: Path) -> str:
+    """What to do where ``latents/<backbone>`` of a job is not there."""
+    job, backbone = folder.parent.parent, folder.name if folder.name in BACKBONES else "FILE"
+    named = shlex.quote(str(job))
+    advice = f"`animatic cache {named} --backbone {backbone}`"
+    if backbone == "FILE":
+        advice += f", FILE being the YAML that says what {folder.name} is"
+    if not job.is_dir() or not any((job / one).exists() for one in ("job.yaml", "shards")):
+        what = "holds no shards of clips" if job.is_dir() else "is not there"
+        return f"{job} is no job: it {what}; label videos first (`animatic label VIDEOS --out {named}`), then {advice}"
+    return f"{job} has no latents for backbone {folder.name}; make them with {advice}"
 
 
 @functools.lru_cache(maxsize=32)

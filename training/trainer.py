@@ -17,7 +17,7 @@ from accelerate.tracking import get_available_trackers
 from accelerate.utils import LoggerType
 from torch.utils.data import DataLoader
 
-from dataset.receipts import atomic_write, make_folder, storage_errors
+from dataset.receipts import atomic_write, storage_errors
 from labeling.errors import ConfigError, DataError
 from training.adapters import trainable_count
 from training.attachment import attach_for_training
@@ -192,6 +192,10 @@ class Trainer:
 
     def _run(self, on_step: Callable[[int, float], None] | None) -> TrainSummary:
         config, start = self.config, self.step
+        if config.trackers:
+            about = {"name": config.name, "stage": config.stage, "seed": config.seed}
+            with storage_errors(self.out):
+                self.accelerator.init_trackers("logs", config=about)
         losses: list[float] = []
         held_out: dict[str, float] = {}
         log = RunLog(
@@ -329,16 +333,10 @@ def _accelerator(config: TrainConfig, out: Path) -> Accelerator:
     if absent:
         raise ConfigError(f"trackers {', '.join(absent)} are not installed; `pip install {' '.join(absent)}`")
     # Precision is the backbone's affair: accelerate would fix it for the whole process, and two runs may differ.
-    accelerator = Accelerator(
+    return Accelerator(
         mixed_precision="no", log_with=list(config.trackers) or None, project_dir=str(out),
         cpu=not torch.cuda.is_available(),
     )  # fmt: skip
-    if config.trackers:
-        if accelerator.is_main_process:
-            make_folder(out)
-        with storage_errors(out):
-            accelerator.init_trackers("logs", config={"name": config.name, "stage": config.stage, "seed": config.seed})
-    return accelerator
 
 
 def _fitting_store(config: TrainConfig, data: Path) -> LatentStore:
