@@ -273,6 +273,31 @@ def test_a_sample_that_overflows_is_said_and_not_decoded(generator, tmp_path: Pa
     assert not list(tmp_path.rglob("*.mp4"))
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"image": Path("nope.png")}, "--image nope.png does not exist; check the path"),
+        ({"image": Path("nope.png"), "caption": "x"}, "--image nope.png does not exist; check the path"),
+        ({"image": Path(__file__)}, "--caption is missing; give --caption TEXT too"),
+        ({"caption": "x"}, "--image is missing; give --image FILE too"),
+        ({}, "nothing to start from; give --image FILE and --caption TEXT, or --data JOB"),
+    ],
+    ids=["no such file", "no such file, with text", "no text", "no picture", "nothing"],
+)
+def test_what_a_picture_s_start_lacks_is_named(given: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        run_generate(out=tmp_path, motion=tmp_path / "unread", appearance=None, **given)
+
+
+def test_missing_adapters_are_named_by_their_options(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("pipelines.generate_clips.chosen_clips", lambda *_: [SAMPLE])
+    words = "^--motion and --appearance are missing; give the adapters .*or --end-to-end alone"
+    with pytest.raises(ConfigError, match=words):
+        show_clips(tmp_path, ClipsRequest(clips="val"), out=tmp_path, motion=None, appearance=None)
+    with pytest.raises(ConfigError, match=words):
+        generate(image=IMAGE, caption="x", out=tmp_path, skeleton=SKELETON, backbone="tiny")
+
+
 @pytest.mark.parametrize("slots", [("motion", "appearance"), ("motion", "end_to_end"), ("end_to_end", "motion")])
 def test_an_adapter_of_another_stage_is_refused_by_name(adapters, tmp_path: Path, slots: tuple[Stage, Stage]) -> None:
     given, slot = slots
