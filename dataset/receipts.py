@@ -161,6 +161,21 @@ def host_name() -> str:
     return re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
 
 
+def is_alive(process: int) -> bool:
+    """Whether a process of this host, by its number, still works."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    try:  # a zombie answers signals, but works no more
+        state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+    except OSError:
+        return True
+    return state != "Z"
+
+
 def worker_name() -> str:
     """A log name that no other process has: host, process, start."""
     return f"{host_name()}-{os.getpid()}-{time.time_ns():x}"

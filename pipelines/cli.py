@@ -1,5 +1,6 @@
 """The command line. Commands import what they run when they are called, so that ``animatic --help`` answers at once."""
 
+import errno
 import os
 import sys
 from pathlib import Path
@@ -53,9 +54,24 @@ def main() -> None:
         if stop.code == STOPPED:
             print("stopped; run the same command again to go on", file=sys.stderr)
         raise
-    except BrokenPipeError:
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            from pipelines.console import print_error
+
+            print_error(_too_long(error))
+            sys.exit(2)
+        if not isinstance(error, BrokenPipeError):
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+
+
+def _too_long(error: OSError) -> Exception:
+    """What is no file's name was still asked for as one: an argument that is a recipe, a preset or a path."""
+    from labeling.errors import ConfigError
+
+    name = str(error.filename or "a name")
+    return ConfigError(f"{name[:40]}... is no path: it has {len(name)} letters, more than a file's name may have")
 
 
 @app.command(rich_help_panel=LABEL)

@@ -16,6 +16,7 @@ from dataset.receipts import (
     check_unaltered,
     digest,
     host_name,
+    is_alive,
     make_folder,
     publish,
     storage_error,
@@ -97,24 +98,10 @@ def sweep_staging(root: Path) -> None:
     for folder in (root / ".staging").glob("*"):
         host, _, process = folder.name.rpartition(".")[2].rpartition("-")
         # A folder that somebody else called otherwise is not ours to remove.
-        if host == host_name() and _PROCESS.fullmatch(process) and not _alive(int(process)):
+        if host == host_name() and _PROCESS.fullmatch(process) and not is_alive(int(process)):
             shutil.rmtree(folder, ignore_errors=True)
     with contextlib.suppress(OSError):
         (root / ".staging").rmdir()
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    try:  # a zombie answers signals, but works no more
-        state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
-    except OSError:
-        return True
-    return state != "Z"
 
 
 def base_receipt(task: Task) -> Receipt:

@@ -136,14 +136,14 @@ def run_generate(
     """
     options = options or GenerateOptions()
     check_start(data=data, clip=clip, image=image, skeleton=skeleton)
+    if data is None:
+        check_given(image, caption)
     tell_unfinished(motion, appearance, end_to_end)
     sample = None if data is None else find_sample(data, clip)
     if sample is not None:
         conditions = clip_conditions(sample, with_ego=ego is None)
-    elif image is not None and caption is not None:
-        conditions = {"image": image, "caption": caption, "skeleton": skeleton, "name": image.stem}
     else:
-        raise ConfigError("nothing to start from; give --image FILE and --caption TEXT, or --data JOB [--clip KEY]")
+        conditions = {"image": image, "caption": caption, "skeleton": skeleton, "name": image.stem if image else None}
     if caption is not None:
         conditions["caption"] = caption
     if ego is not None:
@@ -219,6 +219,21 @@ def check_start(
         )
     if data is None and clip is not None:
         raise ConfigError(f"--clip {clip} is of a job; give --data JOB too")
+
+
+def check_given(image: Path | None, caption: str | None) -> None:
+    """Refuse a start from a picture without the picture, or without its text.
+
+    Raises:
+        ConfigError: one is not given, or there is no such file.
+    """
+    if image is not None and not image.is_file():
+        raise ConfigError(f"--image {image} does not exist; check the path")
+    absent = [name for name, given in (("--image FILE", image), ("--caption TEXT", caption)) if given is None]
+    if len(absent) == 1:
+        raise ConfigError(f"{absent[0].split()[0]} is missing; give {absent[0]} too")
+    if absent:
+        raise ConfigError("nothing to start from; give --image FILE and --caption TEXT, or --data JOB [--clip KEY]")
 
 
 def clip_conditions(sample: Sample, *, with_ego: bool = True) -> dict[str, Any]:

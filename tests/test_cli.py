@@ -360,6 +360,22 @@ def test_what_can_be_mended_is_one_line_and_exit_code_2(run, video, tmp_path, ma
     assert not (tmp_path / "J").exists(), "what cannot be used leaves no job behind"
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train", "motion", "--data", "J", "--config", "a" * 300], ["cache", "J", "--backbone", "a" * 300],
+        ["label", "a" * 300, "-o", "J"],
+    ],
+    ids=["config", "backbone", "video"],
+)  # fmt: skip
+def test_an_argument_that_is_too_long_for_a_file_is_one_line(run, tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(*arguments)
+    assert code == 2 and "Traceback" not in out + err
+    assert err.count("\n") == 1 and f"{'a' * 40}" in err and "a" * 60 not in err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("changes", [["--part", "3/2"], ["--extractors", "nope"]], ids=["part", "card"])
 def test_a_command_that_is_refused_leaves_a_job_as_it_was(run, job, tmp_path, changes):
     root = shutil.copytree(job, tmp_path / "J")

@@ -163,6 +163,19 @@ def test_adapters_of_another_scale_are_refused(tmp_path: Path, settings: dict[st
         load_adapter(tiny_transformer(), tmp_path / "a.safetensors", "motion")
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf")], ids=str)
+def test_an_adapter_whose_numbers_are_not_finite_is_refused(tmp_path: Path, value: float) -> None:
+    """It would make black videos, and nothing would say so."""
+    config = AdapterConfig(rank=4)
+    path = written(tmp_path / "a.safetensors", filled(tiny_transformer(), "x", config), "x", config)
+    tensors = load_file(path)
+    spoilt = sorted(tensors)[3]
+    tensors[spoilt][0, 0] = value
+    save_file(tensors, path)
+    with pytest.raises(ModelError, match=rf"{path}.*1 of its {len(tensors)} tensors.*{spoilt}; take an earlier"):
+        load_adapter(tiny_transformer(), path, "motion")
+
+
 def test_only_the_adapter_is_trainable_and_in_float32() -> None:
     transformer = tiny_transformer()
     torch.nn.Module.to(transformer, torch.bfloat16)

@@ -88,6 +88,43 @@ def test_files_that_cannot_be_used_are_refused(tmp_path: Path, text: str, messag
         load_config(path, stage="motion")
 
 
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"seed": -5}, "seed is -5, but must be 0 or more"),
+        ({"seed": 2**63}, "seed is 9223372036854775808, but must be below"),
+        ({"backbone": {"seed": -1}}, "backbone.seed is -1, but must be 0 or more"),
+        ({"optimiser": {"betas": [2, 0.5]}}, "optimiser.betas.0 is 2, but must be below 1"),
+        ({"optimiser": {"betas": [0.9, -0.5]}}, "optimiser.betas.1 is -0.5, but must be 0 or more"),
+        ({"optimiser": {"epsilon": -1}}, "optimiser.epsilon is -1, but must be 0 or more"),
+        ({"optimiser": {"learning_rate": math.inf}}, "learning_rate is inf, but must be finite"),
+        ({"optimiser": {"max_gradient_norm": math.nan}}, "max_gradient_norm is nan, but must be a number"),
+        ({"optimiser": {"max_gradient_norm": -1}}, "max_gradient_norm is -1, but must be 0 or more"),
+        ({"adapter": {"rank": 100_000_000}}, "adapter.rank is 100000000, but must be 16384 or less"),
+        ({"adapter": {"alpha": math.nan}}, "adapter.alpha is nan, but must be a number"),
+        ({"validation": {"sigmas": [math.nan]}}, "validation.sigmas.0 is nan, but must be a number$"),
+        ({"validation": {"sigmas": [0.5, 7]}}, "validation.sigmas.1 is 7, but must be 1 or less"),
+        ({"validation": {"sigmas": [0]}}, "validation.sigmas.0 is 0, but must be above 0"),
+        ({"validation": {"sigmas": []}}, "validation.sigmas: holds no noise level; give one, or set loss_every"),
+        ({"name": "../../../x"}, "name: names a folder, so it must have no slash.*, got '../../../x'"),
+        ({"name": "a" * 300}, "name: names a folder, .* be 200 bytes at most"),
+        ({"backbone": {"name": "../mine", "kind": "tiny"}}, "backbone.name: names a folder, .*, got '../mine'"),
+        ({"backbone": {"name": "..", "kind": "tiny"}}, "backbone.name: .* not begin with a dot"),
+        ({"backbone": {"name": "", "kind": "tiny"}}, "backbone.name: .* at least 1 character"),
+    ],
+    ids=lambda value: str(value)[:40] if isinstance(value, dict) else "",
+)
+def test_values_that_cannot_be_are_refused(overrides: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_config("tiny", stage="motion", overrides=overrides)
+
+
+@pytest.mark.parametrize("name", ["my run (2)", "läuft", "v1.5-b"])
+def test_names_that_people_give_are_taken(name: str) -> None:
+    config = load_config("tiny", stage="motion", overrides={"name": name, "backbone": {"name": name, "kind": "tiny"}})
+    assert config.name == config.backbone.name == name
+
+
 def test_unknown_names_are_refused_with_what_there_is() -> None:
     with pytest.raises(ConfigError, match="motion_ltx_2b"):
         load_config("motion_ltx_3b")

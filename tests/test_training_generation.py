@@ -210,6 +210,37 @@ def test_trajectory_files_are_resampled_and_must_be_long_enough(tmp_path: Path) 
     assert ego_trajectory(tmp_path / "drive.npy", frames=9, fps=24).cam_to_world[-1, 2, 3] == pytest.approx(8)
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"junk", "is no array of camera poses: it is no whole .npy of numbers; give .T, 4, 4. numbers"),
+        (b"", "is no array of camera poses"),
+        (np.array([{}], object), "is no array of camera poses"),
+        (np.float64(3), r"holds float64 \(\), but a trajectory is \(T, 4, 4\)"),
+        (np.array(["a"] * 9), r"holds <U1 \(9,\), but"),
+        (np.zeros((3, 3)), r"holds float64 \(3, 3\), but"),
+        (np.zeros((0, 4, 4)), r"holds float64 \(0, 4, 4\), but"),
+        (np.zeros((9, 4, 4), complex), r"holds complex128 \(9, 4, 4\), but"),
+    ],
+    ids=["junk", "empty", "objects", "scalar", "text", "other shape", "no pose", "complex"],
+)
+def test_arrays_that_are_no_trajectory_are_named(tmp_path: Path, content: Any, message: str) -> None:
+    path = tmp_path / "drive.npy"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.save(path, content, allow_pickle=True)
+    with pytest.raises(ConfigError, match=f"{path} {message}"):
+        ego_trajectory(path, frames=9, fps=24)
+
+
+def test_an_archive_of_arrays_is_no_trajectory(tmp_path: Path) -> None:
+    np.savez(tmp_path / "drive.npz", a=np.zeros((9, 4, 4)))
+    (tmp_path / "drive.npz").rename(tmp_path / "drive.npy")
+    with pytest.raises(ConfigError, match="drive.npy is no array of camera poses"):
+        ego_trajectory(tmp_path / "drive.npy", frames=9, fps=24)
+
+
 def test_what_is_missing_or_wrong_is_named(generator, adapters, tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(ConfigError, match="--motion and --appearance"):
         ClipGenerator(generator.backbone)
@@ -226,6 +257,45 @@ def test_what_is_missing_or_wrong_is_named(generator, adapters, tmp_path: Path, 
     monkeypatch.setattr(extractors, "find_weights", lambda *_: None)
     with pytest.raises(ConfigError, match="no keypoint extractors"):
         generate(image=IMAGE, caption="x", out=tmp_path, **two_stages(adapters))
+
+
+def test_a_sample_that_overflows_is_said_and_not_decoded(generator, tmp_path: Path, monkeypatch) -> None:
+    sample = generator.backbone.sample
+
+    def overflown(*arguments: Any, **named: Any) -> torch.Tensor:
+        latents = sample(*arguments, **named).half() * 60000
+        return latents.float()
+
+    monkeypatch.setattr(generator.backbone, "sample", overflown)
+    conditions = ClipConditions(image=IMAGE, caption="x", first_control=SKELETON)
+    with pytest.raises(ModelError, match=r"motion stage drew latents of which .*% are not finite.*float32"):
+        write_samples(generator, conditions, out=tmp_path, name="a", settings=FAST)
+    assert not list(tmp_path.rglob("*.mp4"))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"image": Path("nope.png")}, "--image nope.png does not exist; check the path"),
+        ({"image": Path("nope.png"), "caption": "x"}, "--image nope.png does not exist; check the path"),
+        ({"image": Path(__file__)}, "--caption is missing; give --caption TEXT too"),
+        ({"caption": "x"}, "--image is missing; give --image FILE too"),
+        ({}, "nothing to start from; give --image FILE and --caption TEXT, or --data JOB"),
+    ],
+    ids=["no such file", "no such file, with text", "no text", "no picture", "nothing"],
+)
+def test_what_a_picture_s_start_lacks_is_named(given: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        run_generate(out=tmp_path, motion=tmp_path / "unread", appearance=None, **given)
+
+
+def test_missing_adapters_are_named_by_their_options(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("pipelines.generate_clips.chosen_clips", lambda *_: [SAMPLE])
+    words = "^--motion and --appearance are missing; give the adapters .*or --end-to-end alone"
+    with pytest.raises(ConfigError, match=words):
+        show_clips(tmp_path, ClipsRequest(clips="val"), out=tmp_path, motion=None, appearance=None)
+    with pytest.raises(ConfigError, match=words):
+        generate(image=IMAGE, caption="x", out=tmp_path, skeleton=SKELETON, backbone="tiny")
 
 
 @pytest.mark.parametrize("slots", [("motion", "appearance"), ("motion", "end_to_end"), ("end_to_end", "motion")])

@@ -1,6 +1,7 @@
 """Latents: fingerprinted, resumable, by part, from labels and not from decoded skeletons."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -387,11 +388,16 @@ def test_weights_load_from_a_folder_and_from_the_hubs_cache(tmp_path: Path, empt
     assert load_backbone(backbone_config("ltx-2b", **told)).fingerprint() == tiny
 
 
+LTX_PARTS = re.escape("--include 'vae/*' --include 'transformer/*' --include 'tokenizer/*' --include 'text_encoder/*'")
+
+
 @pytest.mark.parametrize(
     ("preset", "use", "message"),
     [
         ("ltx-2b", "vae", r"'Lightricks/LTX-Video' .*nothing is downloaded.*/hub lacks vae/config.json, vae/\*"),
-        ("ltx-2b", "vae", r"`hf download Lightricks/LTX-Video --include 'vae/\*'`.*`weights`.* YAML"),
+        ("ltx-2b", "vae", rf"`hf download Lightricks/LTX-Video {LTX_PARTS}`.*`weights`.* YAML"),
+        ("ltx-2b", "text", rf"`hf download Lightricks/LTX-Video {LTX_PARTS}`"),
+        ("svd", "vae", r"`hf download \S+ --include 'vae/\*' --include 'unet/\*' --include 'image_encoder/\*'`"),
         ("ltx-13b", "denoiser", r"'Lightricks/LTX-Video-0.9.7-dev' .*lacks transformer/config.json"),
         ("ltx-2b", "text", r"lacks tokenizer/tokenizer_config.json, text_encoder/config.json"),
         ("svd", "text", r"'google/t5-v1_1-large' .*lacks tokenizer_config.json, config.json.*v1_1-large`"),

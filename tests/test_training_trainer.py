@@ -237,6 +237,19 @@ def test_out_of_memory_says_which_knobs_to_turn_in_order(tiny_job: Path, tmp_pat
     assert not any("micro_batch" in knob or "gradient" in knob or "rank" in knob for knob in memory_knobs(thrifty))
 
 
+def test_an_adapter_that_is_too_large_gets_the_same_advice(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811
+    config = tiny_config("motion", adapter={"rank": 128})
+    backbone = load_backbone(config.backbone)
+
+    def full(*_: Any) -> list[torch.nn.Parameter]:
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 1 bytes")
+
+    backbone.attach = full  # type: ignore[method-assign]
+    with pytest.raises(TrainingError, match="lower adapter.rank from 128"):
+        run(config, tiny_job, tmp_path / "out", backbone=backbone)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     "error",
     [

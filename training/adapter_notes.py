@@ -12,6 +12,8 @@ from safetensors import SafetensorError, safe_open
 from labeling.errors import ModelError
 
 OUR_METADATA = "animatic"
+_SECTIONS = ("optimiser", "backbone", "conditions")
+"""Of the settings, what is read again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,26 +38,58 @@ def read_about(path: Path) -> dict[str, Any]:
     """What the trainer noted in an adapter file; empty for foreign files.
 
     Raises:
-        ModelError: missing, or not safetensors.
+        ModelError: missing, not safetensors, or with notes that are none.
     """
     with open_adapter(adapter_file(path), framework="np") as file:
-        return notes(file.metadata() or {})
+        return notes(path, file.metadata() or {})
 
 
 def read_progress(path: Path) -> Progress | None:
     """How far an adapter's training has come; None where the file does not tell.
 
     Raises:
-        ModelError: missing, or not safetensors.
+        ModelError: as ``read_about``.
     """
     about = read_about(path)
     step, steps = about.get("step"), about.get("config", {}).get("optimiser", {}).get("steps")
     return Progress(step=step, steps=steps) if isinstance(step, int) and isinstance(steps, int) else None
 
 
-def notes(metadata: Mapping[str, str]) -> dict[str, Any]:
-    """The trainer's notes among a file's metadata."""
-    return json.loads(metadata.get(OUR_METADATA, "{}"))
+def notes(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """The trainer's notes among a file's metadata.
+
+    Raises:
+        ModelError: they are no JSON, or not what the trainer writes.
+    """
+    told = metadata_object(path, metadata, OUR_METADATA)
+    config = told.get("config", {})
+    sections = [config, *(config.get(name, {}) for name in _SECTIONS)] if isinstance(config, dict) else [config]
+    plain = isinstance(told.get("stage", ""), str) and isinstance(told.get("frames", 0), int)
+    if not plain or not all(isinstance(one, dict) for one in sections):
+        raise ModelError(
+            f"{path}: its metadata {OUR_METADATA!r} holds no settings of a training; take the file as training wrote "
+            "it, or a checkpoint's"
+        )
+    return told
+
+
+def metadata_object(path: Path, metadata: Mapping[str, str], name: str) -> dict[str, Any]:
+    """A JSON object among a file's metadata; empty where there is none.
+
+    Raises:
+        ModelError: it is something else.
+    """
+    text = metadata.get(name, "{}")
+    try:
+        told = json.loads(text)
+    except ValueError:
+        told = None
+    if not isinstance(told, dict):
+        raise ModelError(
+            f"{path}: its metadata {name!r} is no JSON object ({text[:40]!r}); take the file as it was written, or "
+            "remove that entry"
+        )
+    return told
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ Switching changes flags only: the base weights are never merged, so switching of
 """
 
 import json
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from peft import LoraConfig, inject_adapter_in_model
 from peft.tuners.tuners_utils import BaseTunerLayer
 
 from labeling.errors import ModelError
-from training.adapter_notes import OUR_METADATA, adapter_file, notes, open_adapter
+from training.adapter_notes import OUR_METADATA, adapter_file, metadata_object, notes, open_adapter
 from training.config import AdapterConfig
 from training.weights import tensor_bytes
 
@@ -168,23 +169,24 @@ def read_adapter(path: Path) -> AdapterFile:
 
     Raises:
         ModelError: missing, not safetensors, without a LoRA in it, or one of a kind that would act at another scale:
-            rank-stabilised, DoRA, alphas that differ from module to module.
+            rank-stabilised, DoRA, alphas that differ from module to module; or with numbers that are not finite.
     """
     path = adapter_file(path)
     with open_adapter(path, framework="pt") as file:
         metadata = file.metadata() or {}
         raw = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    _check_finite(path, raw)
     extra = {key.removeprefix(EXTRA_PREFIX): raw.pop(key) for key in list(raw) if key.startswith(EXTRA_PREFIX)}
-    alphas = {float(raw.pop(key)) for key in list(raw) if key.endswith(".alpha")}
+    alphas = {_number(path, key, raw.pop(key)) for key in list(raw) if key.endswith(".alpha")}
     tensors = {_plain_key(key): tensor for key, tensor in raw.items()}
-    ranks = {tensor.shape[0] for key, tensor in tensors.items() if key.endswith(".lora_A.weight")}
+    ranks = {tensor.shape[:1].numel() for key, tensor in tensors.items() if key.endswith(".lora_A.weight")}
     if len(ranks) != 1 or any(".lora_A.weight" not in key and ".lora_B.weight" not in key for key in tensors):
         raise ModelError(
             f"{path} is no plain LoRA: ranks {sorted(ranks)}, keys such as {next(iter(raw), 'none')!r}; one rank and "
             "lora_A / lora_B pairs are expected"
         )
     rank = ranks.pop()
-    settings = _settings(metadata)
+    settings = _settings(path, metadata)
     special = [name for name in _SPECIAL if settings.get(name)]
     if special or len(alphas) > 1:
         found = special or [f"alphas {sorted(alphas)}"]
@@ -192,10 +194,22 @@ def read_adapter(path: Path) -> AdapterFile:
             f"{path} is no plain LoRA: it has {', '.join(found)}, and would act at another scale than it was trained "
             "at; one alpha for all modules, and the scale alpha / rank, are expected"
         )
-    alpha = float(settings["lora_alpha"]) if "lora_alpha" in settings else alphas.pop() if alphas else float(rank)
+    if "lora_alpha" in settings:
+        alphas = {_number(path, "lora_alpha", settings["lora_alpha"])}
+    alpha = alphas.pop() if alphas else float(rank)
     targets = tuple(sorted({key.split(".lora_")[0] for key in tensors}))
-    about = notes(metadata)
+    about = notes(path, metadata)
     return AdapterFile(tensors=tensors, extra=extra, rank=rank, alpha=alpha, targets=targets, about=about)
+
+
+def _check_finite(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
+    """Refuse what would draw black videos without a word."""
+    broken = [key for key, tensor in tensors.items() if not tensor.float().isfinite().all()]
+    if broken:
+        raise ModelError(
+            f"{path} cannot be used: {len(broken)} of its {len(tensors)} tensors hold numbers that are not finite, "
+            f"such as {broken[0]}; take an earlier checkpoint, or train again with a lower optimiser.learning_rate"
+        )
 
 
 def _plain_key(key: str) -> str:
@@ -212,9 +226,19 @@ def _plain_key(key: str) -> str:
     return f"{head}.lora_{tail[0]}.weight" if head and tail.endswith(".weight") else key
 
 
-def _settings(metadata: Mapping[str, str]) -> dict[str, Any]:
+def _number(path: Path, name: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, RuntimeError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ModelError(f"{path}: {name} is {value!r}, but must be a finite number; take the file as it was written")
+    return number
+
+
+def _settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     """PEFT's settings in diffusers' metadata, without the model's name before each."""
-    settings = json.loads(metadata.get(DIFFUSERS_METADATA, "{}"))
+    settings = metadata_object(path, metadata, DIFFUSERS_METADATA)
     return {key.split(".")[-1]: value for key, value in settings.items()}
 
 

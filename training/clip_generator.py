@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from labeling.camera import Trajectory
-from labeling.errors import ConfigError
+from labeling.errors import ConfigError, ModelError
 from training.adapter_notes import read_about
 from training.adapters import AdapterFile, activate_adapter
 from training.backbone import Backbone, SamplingSettings, TextEmbedding
@@ -135,6 +135,7 @@ class ClipGenerator:
 
         Raises:
             ConfigError: a condition is missing, or sizes do not fit.
+            ModelError: the network draws numbers that are not finite.
         """
         settings = settings or SamplingSettings()
         if "end_to_end" in self.files:
@@ -227,7 +228,19 @@ class ClipGenerator:
         latents = self.backbone.sample(
             inputs.to(self.backbone.device), noise_BCFHW=noise, empty_text=self._empty, settings=settings
         )
+        self._check_finite(stage, latents, settings)
         return latents[0].cpu()
+
+    def _check_finite(self, stage: Stage, latents: torch.Tensor, settings: SamplingSettings) -> None:
+        """Refuse what would decode to black frames."""
+        share = 1 - float(latents.isfinite().float().mean())
+        if share:
+            config = self.backbone.config
+            raise ModelError(
+                f"the {stage} stage drew latents of which {share:.1%} are not finite, with guidance "
+                f"{settings.guidance:g} on {config.name} in {config.dtype}; lower --guidance, set backbone.dtype to "
+                "float32, or take an earlier checkpoint of the adapter"
+            )
 
     def _handed_over(self, control: torch.Tensor, shown: np.ndarray) -> torch.Tensor:
         """The control's latents at the size that the appearance stage was trained with."""

@@ -7,20 +7,36 @@ motion steps under a cosine, 5,000 appearance steps under a line, LoRA of rank 5
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from labeling.errors import ConfigError
 from labeling.settings_files import laid_over, parse_settings, read_yaml
 
 Stage = Literal["motion", "appearance", "end_to_end"]
 STAGES: tuple[Stage, ...] = ("motion", "appearance", "end_to_end")
+_LONGEST_NAME = 200
+"""Bytes: file systems take 255, and the stage's name is added."""
 CONFIG_FOLDER = Path(__file__).with_name("configs")
 
 
 class _Settings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
+
+
+def _one_folder(name: str) -> str:
+    if name.startswith(".") or set(name) & {"/", "\\", "\0"} or len(name.encode()) > _LONGEST_NAME:
+        raise ValueError(
+            f"names a folder, so it must have no slash, not begin with a dot, and be {_LONGEST_NAME} bytes at most"
+        )
+    return name
+
+
+FolderName = Annotated[str, AfterValidator(_one_folder)]
+"""Text that is the name of one folder, and leads nowhere else."""
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+"""What torch's and numpy's generators both take."""
 
 
 class PictureConfig(_Settings):
@@ -60,7 +76,7 @@ def exact_rate(fps: float) -> Fraction:
 class BackboneConfig(_Settings):
     """Which network, where its weights are, and at what sizes it works. ``name`` alone picks a preset."""
 
-    name: str
+    name: FolderName = Field(min_length=1)
     """Also the folder of its latents in a job: ``latents/<name>``."""
     kind: Literal["tiny", "ltx", "svd", "tiny_svd"]
     size: Literal["tiny", "2b", "13b", "svd"] = "tiny"
@@ -81,7 +97,7 @@ class BackboneConfig(_Settings):
     text_tokens: int = 128
     """Captions are cut and padded to this many tokens."""
     vae_tiling: bool = False
-    seed: int = 0
+    seed: Seed = 0
     """Of the random weights of the tiny kinds."""
     picture: PictureConfig = PictureConfig()
 
@@ -131,7 +147,8 @@ BACKBONES: dict[str, dict[str, Any]] = {
 class AdapterConfig(_Settings):
     """The LoRA that is trained (Hu et al. 2021)."""
 
-    rank: int = Field(default=512, ge=1)
+    rank: int = Field(default=512, ge=1, le=16384)
+    """More than the widest layer of the backbones has, 16,384, would add nothing but memory."""
     alpha: float | None = None
     """Scale is alpha / rank; None means alpha = rank."""
     targets: tuple[str, ...] = ("to_k", "to_q", "to_v", "to_out.0", "ff.net.0.proj", "ff.net.2")
@@ -165,13 +182,16 @@ class TargetedNoiseConfig(_Settings):
     formula: Literal["variance", "blend"] = "variance"
 
 
+_Momentum = Annotated[float, Field(ge=0, lt=1)]
+
+
 class OptimiserConfig(_Settings):
     """AdamW and its schedule, counted in optimiser steps."""
 
     learning_rate: float = Field(default=2e-4, gt=0)
-    betas: tuple[float, float] = (0.9, 0.95)
+    betas: tuple[_Momentum, _Momentum] = (0.9, 0.95)
     weight_decay: float = Field(default=0.01, ge=0)
-    epsilon: float = 1e-8
+    epsilon: float = Field(default=1e-8, ge=0)
     steps: int = Field(ge=1)
     global_batch: int = Field(default=32, ge=1)
     """Samples per optimiser step over all processes."""
@@ -181,7 +201,8 @@ class OptimiserConfig(_Settings):
     warmup_steps: int = Field(default=0, ge=0)
     final_factor: float = Field(default=0.0, ge=0, le=1)
     """Learning rate of the last step over the peak."""
-    max_gradient_norm: float | None = 1.0
+    max_gradient_norm: float | None = Field(default=1.0, ge=0)
+    """Gradients are clipped to this norm; None or 0 leaves them as they are."""
 
 
 class CheckpointConfig(_Settings):
@@ -191,12 +212,21 @@ class CheckpointConfig(_Settings):
     keep: int = Field(default=3, ge=1)
 
 
+_Share = Annotated[float, Field(gt=0, le=1)]
+
+
+def _some(levels: tuple[float, ...]) -> tuple[float, ...]:
+    if not levels:
+        raise ValueError("holds no noise level; give one, or set loss_every_steps to 0")
+    return levels
+
+
 class ValidationConfig(_Settings):
     """Held-out loss and validation videos."""
 
     loss_every_steps: int = Field(default=250, ge=0)
     """0 switches it off."""
-    sigmas: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7, 0.9)
+    sigmas: Annotated[tuple[_Share, ...], AfterValidator(_some)] = (0.1, 0.3, 0.5, 0.7, 0.9)
     """Fixed noise levels, so that curves compare; shares of the way to pure noise."""
     clips: int = Field(default=8, ge=1)
     videos_every_steps: int = Field(default=0, ge=0)
@@ -209,7 +239,8 @@ class ValidationConfig(_Settings):
 class TrainConfig(_Settings):
     """One training run."""
 
-    name: str = ""
+    name: FolderName = ""
+    """Also the folder of its adapter in a job, where no other is given: ``adapters/<name>_<stage>``."""
     stage: Stage
     backbone: BackboneConfig
     adapter: AdapterConfig = AdapterConfig()
@@ -218,7 +249,7 @@ class TrainConfig(_Settings):
     optimiser: OptimiserConfig
     checkpoint: CheckpointConfig = CheckpointConfig()
     validation: ValidationConfig = ValidationConfig()
-    seed: int = 0
+    seed: Seed = 0
     gradient_checkpointing: bool = True
     compile: bool = False
     """torch.compile of the transformer's blocks."""

@@ -145,7 +145,13 @@ def open_generator(
         ConfigError: no adapter, ones that exclude each other, or none that says which backbone it is for.
         ModelError: weights that are absent or do not fit.
     """
-    loaded = _loaded_backbone(backbone, [motion, appearance, end_to_end], device)
+    adapters = [motion, appearance, end_to_end]
+    if not any(adapters):
+        raise ConfigError(
+            "--motion and --appearance are missing; give the adapters that training wrote (either alone works too), or "
+            "--end-to-end alone"
+        )
+    loaded = _loaded_backbone(backbone, adapters, device)
     return ClipGenerator(loaded, motion=motion, appearance=appearance, end_to_end=end_to_end, frames=frames)
 
 

@@ -9,6 +9,7 @@ latents/<backbone>/cache.json             fingerprint, its parts, sizes
 import functools
 import hashlib
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 
 from labeling.errors import DataError
 from training.backbone import TextEmbedding
+from training.config import BACKBONES
 from training.stages import OBJECTS
 
 MANIFEST = "cache.json"
@@ -73,6 +75,20 @@ class CacheManifest:
         return json.dumps({"fingerprint": self.fingerprint, **asdict(self)}, sort_keys=True, indent=1) + "\n"
 
 
+_MANIFEST_TYPES = {"parts": dict, "frames": int, "fps": int | float, "backbone": dict}
+_RECORD_TYPES = {"key": str, "split": str, "caption": str, "file": str, "size": int, "source": str, "turn": int}
+
+
+def _of_types(tree: Any, types: Mapping[str, Any]) -> dict[str, Any]:
+    """The named values of a JSON object; TypeError or KeyError where they are absent or of another kind."""
+    if not isinstance(tree, dict):
+        raise TypeError(f"it holds a {type(tree).__name__}")
+    for name, kind in types.items():
+        if not isinstance(tree[name], kind):
+            raise TypeError(f"{name} is {tree[name]!r}")
+    return {name: tree[name] for name in types}
+
+
 def read_manifest(folder: Path) -> CacheManifest | None:
     """The manifest of a store, or None where there is none.
 
@@ -84,7 +100,7 @@ def read_manifest(folder: Path) -> CacheManifest | None:
         return None
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
-        return CacheManifest(**{name: tree[name] for name in ("parts", "frames", "fps", "backbone")})
+        return CacheManifest(**_of_types(tree, _MANIFEST_TYPES))
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} is no manifest of latents ({error}); remove {folder} and cache again") from error
 
@@ -116,7 +132,7 @@ class LatentStore:
         self.folder = Path(folder)
         manifest = read_manifest(self.folder)
         if manifest is None:
-            raise DataError(f"{self.folder} holds no latents; make them with `animatic cache JOB --backbone NAME`")
+            raise DataError(_none_there(self.folder))
         self.manifest = manifest
         self._records = {record.key: record for record in read_records(self.folder) if not record.retired}
 
@@ -182,6 +198,19 @@ class LatentStore:
         return _read_text(self.folder, caption)
 
 
+def _none_there(folder: Path) -> str:
+    """What to do where ``latents/<backbone>`` of a job is not there."""
+    job, backbone = folder.parent.parent, folder.name if folder.name in BACKBONES else "FILE"
+    named = shlex.quote(str(job))
+    advice = f"`animatic cache {named} --backbone {backbone}`"
+    if backbone == "FILE":
+        advice += f", FILE being the YAML that says what {folder.name} is"
+    if not job.is_dir() or not any((job / one).exists() for one in ("job.yaml", "shards")):
+        what = "holds no shards of clips" if job.is_dir() else "is not there"
+        return f"{job} is no job: it {what}; label videos first (`animatic label VIDEOS --out {named}`), then {advice}"
+    return f"{job} has no latents for backbone {folder.name}; make them with {advice}"
+
+
 @functools.lru_cache(maxsize=32)
 def _read_text(folder: Path, caption: str) -> TextEmbedding:
     path = text_path(folder, caption)
@@ -202,13 +231,29 @@ def read_records(folder: Path) -> Sequence[ClipRecord]:
     """The newest record of each clip over all parts, retired ones too; a torn last line is ignored.
 
     Turns tell which is newest, not the order of files: a clip's part changes with the number of parts.
+
+    Raises:
+        DataError: a whole line is no record.
     """
     latest: dict[str, ClipRecord] = {}
     for path in sorted(folder.glob("clips-*.jsonl")):
-        *whole, _torn = path.read_text(encoding="utf-8").split("\n")
-        for line in whole:
-            record = ClipRecord(**json.loads(line))
+        *whole, _torn = path.read_bytes().split(b"\n")
+        for number, line in enumerate(whole, start=1):
+            record = _read_record(path, number, line)
             known = latest.get(record.key)
             if known is None or record.turn >= known.turn:
                 latest[record.key] = record
     return [latest[key] for key in sorted(latest)]
+
+
+def _read_record(path: Path, number: int, line: bytes) -> ClipRecord:
+    try:
+        tree = json.loads(line)
+        # Older records tell no turn.
+        _of_types({"turn": 0, **tree}, _RECORD_TYPES)
+        return ClipRecord(**tree)
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{path}:{number}: is no record of a clip's latents ({error}); take the line away and run `animatic cache` "
+            "again, which makes what is missing"
+        ) from error

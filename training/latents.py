@@ -9,7 +9,6 @@ retired: every part says so in its own log, so that no host waits for another.
 
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,12 +18,13 @@ import numpy as np
 import torch
 
 from dataset.layout import LATENTS
-from dataset.receipts import digest, hashed_share, make_folder, storage_errors, sync_folder
+from dataset.receipts import atomic_write, digest, hashed_share, make_folder, storage_errors
 from labeling.camera import Intrinsics
 from labeling.errors import ConfigError, DataError
 from labeling.skeleton_video import DEFAULT_STYLE
 from training.backbone import Backbone
 from training.backbones import load_backbone
+from training.claims import sweep
 from training.clip_views import ClipSample, ClipViews, frame_indices
 from training.config import BackboneConfig, PictureConfig, backbone_config
 from training.latent_store import (
@@ -161,8 +161,9 @@ def _open_store(folder: Path, manifest: CacheManifest, *, refresh: bool) -> None
             check_fresh(folder, held, manifest.parts)
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    sweep(folder.rglob(".*.tmp"))
     if held is None or held.parts != manifest.parts:
-        write_whole(folder / MANIFEST, manifest.to_json().encode())
+        atomic_write(folder / MANIFEST, manifest.to_json().encode())
 
 
 def _cache_part(
@@ -294,7 +295,7 @@ def _write_clip(folder: Path, tensors: Mapping[str, torch.Tensor], sample: ClipS
     """The clip's file, relative to the store's folder, and its bytes."""
     path = folder / "clips" / sample.key.rpartition("_")[0] / f"{sample.key}.safetensors"
     data = tensor_bytes(tensors, metadata={"key": sample.key})
-    write_whole(path, data)
+    atomic_write(path, data)
     return str(path.relative_to(folder)), len(data)
 
 
@@ -303,24 +304,7 @@ def _cache_texts(folder: Path, captions: Sequence[str], backbone: Backbone) -> N
         path = text_path(folder, caption)
         if not path.is_file():
             tokens = backbone.encode_text([caption])[0].tokens_LD.to(getattr(torch, backbone.config.latent_dtype))
-            write_whole(path, tensor_bytes({"tokens": tokens.contiguous()}, metadata={"caption": caption}))
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name, sync it, rename it: it is there whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
+            atomic_write(path, tensor_bytes({"tokens": tokens.contiguous()}, metadata={"caption": caption}))
 
 
 def _append_line(log: Path, line: str) -> None:
@@ -334,7 +318,7 @@ def _cut_torn_line(log: Path) -> None:
     if log.is_file():
         data = log.read_bytes()
         if data and not data.endswith(b"\n"):
-            write_whole(log, data[: data.rfind(b"\n") + 1])
+            atomic_write(log, data[: data.rfind(b"\n") + 1])
 
 
 def open_store(job_dir: Path, config: BackboneConfig) -> LatentStore:

@@ -24,7 +24,7 @@ from training.flow import (
 )
 from training.parts import LazyParts
 from training.text import embed_captions
-from training.weights import digest_module, load_pretrained, load_text_encoder
+from training.weights import TEXT_PARTS, digest_module, load_pretrained, load_text_encoder
 
 TRANSFORMERS: dict[str, dict[str, Any]] = {
     "2b": {},
@@ -211,10 +211,15 @@ def load_ltx(config: BackboneConfig, *, device: str | torch.device = "cpu", part
 
 def _makers(config: BackboneConfig, source: str) -> dict[str, Callable[[], Any]]:
     dtype, text_source, told = getattr(torch, config.dtype), config.text_weights or source, config.weights_config
+    needed = ("vae", "transformer", *(TEXT_PARTS if text_source == source else ()))
     return {
         "denoiser": lambda: load_pretrained(
-            LTXVideoTransformer3DModel, source, "transformer", dtype=dtype, file_config=told
+            LTXVideoTransformer3DModel, source, "transformer", dtype=dtype, file_config=told, needed=needed
         ),
-        "vae": lambda: load_pretrained(AutoencoderKLLTXVideo, source, "vae", dtype=dtype, file_config=told),
-        "text": lambda: load_text_encoder(text_source, dtype=dtype, single_file=Path(source).is_file()),
+        "vae": lambda: load_pretrained(
+            AutoencoderKLLTXVideo, source, "vae", dtype=dtype, file_config=told, needed=needed
+        ),
+        "text": lambda: load_text_encoder(
+            text_source, dtype=dtype, single_file=Path(source).is_file(), needed=needed if text_source == source else ()
+        ),
     }

@@ -4,6 +4,7 @@ import json
 import resource
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from accelerate import Accelerator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dataset.receipts import make_folder, storage_errors
+from dataset.receipts import atomic_write, make_folder, storage_errors
 
 METRICS = "metrics.jsonl"
 
@@ -52,12 +53,9 @@ class RunLog:
         self._task = self._progress.add_task("train", total=steps, completed=start, loss="-", rate="", memory="")
         if self._main:
             make_folder(out)
-            kept = [line for line in self._lines() if json.loads(line)["step"] <= start]
             with storage_errors(self._path):
-                self._path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
-
-    def _lines(self) -> list[str]:
-        return self._path.read_text(encoding="utf-8").split("\n")[:-1] if self._path.is_file() else []
+                kept = [line for line, values in _whole_lines(self._path) if values["step"] <= start]
+                atomic_write(self._path, "".join(f"{line}\n" for line in kept).encode())
 
     def __enter__(self) -> "RunLog":
         self._progress.start()
@@ -91,6 +89,22 @@ class RunLog:
 
 
 def read_metrics(out: Path) -> list[dict[str, Any]]:
-    """The lines of a run's ``metrics.jsonl``."""
-    path = out / METRICS
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.is_file() else []
+    """The lines of a run's ``metrics.jsonl``; damaged ones are left out with a warning."""
+    return [values for _, values in _whole_lines(out / METRICS)]
+
+
+def _whole_lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """(line, its values) of the lines that tell a step; a torn last line is ignored, others are warned of."""
+    whole: list[tuple[str, dict[str, Any]]] = []
+    if not path.is_file():
+        return whole
+    *lines, _torn = path.read_bytes().split(b"\n")
+    for number, line in enumerate(lines, start=1):
+        try:
+            values = json.loads(line)
+            if not isinstance(values["step"], int):
+                raise TypeError(f"step is {values['step']!r}")
+            whole.append((line.decode(), values))
+        except (ValueError, KeyError, TypeError) as error:
+            warnings.warn(f"leaving out {path}:{number}, which tells no step ({error!r})", stacklevel=3)
+    return whole

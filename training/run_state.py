@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from labeling.errors import DataError
@@ -14,7 +15,11 @@ from training.adapters import adapter_bytes, put_adapter, read_adapter
 from training.config import TrainConfig
 
 ADAPTER, OPTIMISER, STATE = "adapter.safetensors", "optimiser.safetensors", "state.json"
+FILES = (ADAPTER, OPTIMISER, STATE)
+"""Of a checkpoint; the run goes on from no fewer."""
 _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
+_SECTIONS = ("backbone", "optimiser")
+"""Of the settings, those that are compared field by field."""
 _HARMLESS = ("backbone.vae_tiling",)
 """Of the backbone's settings: training decodes validation videos alone."""
 
@@ -72,9 +77,25 @@ def read_state(checkpoint: Path) -> RunState:
     try:
         tree = json.loads((checkpoint / STATE).read_text(encoding="utf-8"))
         # Older checkpoints hold how far a loader got as well, which is not needed.
-        return RunState(step=tree["step"], config=tree["config"], data=tree.get("data", ""))
+        state = RunState(step=tree["step"], config=tree["config"], data=tree.get("data", ""))
+        _check(state)
+        return state
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{checkpoint / STATE} is no run state ({error}); start afresh with --resume never") from error
+        raise DataError(
+            f"{checkpoint / STATE} is no run state ({error}); take an earlier checkpoint with --resume, or give "
+            "another --out"
+        ) from error
+
+
+def _check(state: RunState) -> None:
+    """ValueError where a state is none."""
+    if not isinstance(state.step, int) or state.step < 0:
+        raise ValueError(f"step is {state.step!r}")
+    if not isinstance(state.data, str):
+        raise ValueError(f"data is {state.data!r}")
+    sections = [state.config.get(name, {}) for name in _SECTIONS] if isinstance(state.config, dict) else [state.config]
+    if not all(isinstance(one, dict) for one in sections):
+        raise ValueError("config holds no settings by name")
 
 
 def restore(
@@ -84,15 +105,18 @@ def restore(
 
     Raises:
         ModelError: the adapter does not fit.
-        DataError: moments are missing.
+        DataError: moments are missing or cannot be read.
     """
     file = read_adapter(checkpoint / ADAPTER)
     put_adapter(denoiser, adapter, file.tensors | file.extra, source=str(checkpoint))
-    tensors = load_file(checkpoint / OPTIMISER)
+    try:
+        tensors = load_file(checkpoint / OPTIMISER)
+    except (OSError, SafetensorError) as error:
+        raise DataError(f"{checkpoint / OPTIMISER} cannot be read ({error}); take an earlier checkpoint") from error
     for name, parameter in zip(names, optimiser.param_groups[0]["params"], strict=True):
         moments = {kind: tensors[f"{kind}/{name}"] for kind in _MOMENTS if f"{kind}/{name}" in tensors}
         if tensors and len(moments) != len(_MOMENTS):
-            raise DataError(f"{checkpoint / OPTIMISER} lacks the moments of {name}; start afresh with --resume never")
+            raise DataError(f"{checkpoint / OPTIMISER} lacks the moments of {name}; give another --out to start afresh")
         if moments:
             # AdamW keeps its step counter on the CPU unless it is fused.
             optimiser.state[parameter] = {

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from dataset.tables import read_keypoints
-from labeling.camera import Intrinsics, Trajectory, cover_map, read_kitti, read_tum, resample
+from labeling.camera import Intrinsics, Trajectory, cover_map, read_kitti, read_tum, rebased_trajectory, resample
 from labeling.ego_video import ego_frames
 from labeling.errors import ConfigError, DataError
 from labeling.labels import Keypoints
@@ -155,14 +155,13 @@ def ego_trajectory(source: str | Path | Trajectory, *, frames: int, fps: float) 
     """A trajectory of ``frames`` poses from a recipe, a TUM or KITTI file, an (T, 4, 4) ``.npy``, or one at hand.
 
     Raises:
-        ConfigError: neither a file nor a recipe, or the file is too short.
+        ConfigError: neither a file nor a recipe, a ``.npy`` of something else, or the file is too short.
+        TrajectoryError: poses that are none.
     """
     if isinstance(source, Trajectory):
         given = source
     elif Path(source).suffix == ".npy" and Path(source).is_file():
-        poses = np.load(source, allow_pickle=False)
-        from labeling.camera import rebased_trajectory
-
+        poses = _poses(Path(source))
         given = rebased_trajectory(np.arange(len(poses)) / fps, poses)
     elif Path(source).is_file():
         given = read_tum(Path(source)) if Path(source).suffix == ".tum" else read_kitti(Path(source), fps=fps)
@@ -175,6 +174,22 @@ def ego_trajectory(source: str | Path | Trajectory, *, frames: int, fps: float) 
             f"{(frames - 1) / fps:.2f} s; give a longer one"
         )
     return resample(given, np.minimum(wanted, given.timestamps_s[-1]))
+
+
+def _poses(path: Path) -> np.ndarray:
+    """(T, 4, 4) numbers of a ``.npy``; nothing is unpickled."""
+    try:
+        held = np.load(path, allow_pickle=False)
+        found = f"{held.dtype} {held.shape}"
+    # Bytes of another kind lead numpy to any of these; an archive of arrays has no type.
+    except (ValueError, OSError, EOFError, MemoryError, SyntaxError, AttributeError) as error:
+        raise ConfigError(
+            f"{path} is no array of camera poses: it is no whole .npy of numbers; give (T, 4, 4) numbers that "
+            "numpy.save wrote, or a TUM or KITTI file"
+        ) from error
+    if held.dtype.kind not in "fiu" or held.ndim != 3 or held.shape[1:] != (4, 4) or not len(held):
+        raise ConfigError(f"{path} holds {found}, but a trajectory is (T, 4, 4) numbers: cam_to_world of each frame")
+    return held
 
 
 def ego_clip(trajectory: Trajectory, *, picture: PictureConfig, intrinsics: Intrinsics | None = None) -> np.ndarray:

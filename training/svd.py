@@ -27,7 +27,7 @@ from training.config import AdapterConfig, BackboneConfig, TrainConfig
 from training.parts import LazyParts
 from training.stages import IMAGE, reference_names
 from training.text import embed_captions
-from training.weights import digest_module, load_image_encoder, load_pretrained, load_text_encoder
+from training.weights import TEXT_PARTS, digest_module, load_image_encoder, load_pretrained, load_text_encoder
 
 SVD_GEOMETRY = LatentGeometry(channels=4, spatial=8, temporal=1, multiple=64)
 LATENT_SCALE = 0.18215
@@ -308,9 +308,12 @@ def load_svd(config: BackboneConfig, *, device: str | torch.device = "cpu", part
 
 def _makers(config: BackboneConfig, source: str) -> dict[str, Callable[[], Any]]:
     dtype, text = getattr(torch, config.dtype), config.text_weights or source
+    needed = ("vae", "unet", "image_encoder", *(TEXT_PARTS if text == source else ()))
     return {
-        "denoiser": lambda: load_pretrained(UNetSpatioTemporalConditionModel, source, "unet", dtype=dtype),
-        "vae": lambda: load_pretrained(AutoencoderKLTemporalDecoder, source, "vae", dtype=dtype),
-        "text": lambda: load_text_encoder(text, dtype=dtype),
-        "image": lambda: load_image_encoder(source, dtype=dtype),
+        "denoiser": lambda: load_pretrained(
+            UNetSpatioTemporalConditionModel, source, "unet", dtype=dtype, needed=needed
+        ),
+        "vae": lambda: load_pretrained(AutoencoderKLTemporalDecoder, source, "vae", dtype=dtype, needed=needed),
+        "text": lambda: load_text_encoder(text, dtype=dtype, needed=needed if text == source else ()),
+        "image": lambda: load_image_encoder(source, dtype=dtype, needed=needed),
     }

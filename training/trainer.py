@@ -17,7 +17,7 @@ from accelerate.tracking import get_available_trackers
 from accelerate.utils import LoggerType
 from torch.utils.data import DataLoader
 
-from dataset.receipts import make_folder, storage_errors
+from dataset.receipts import atomic_write, storage_errors
 from labeling.errors import ConfigError, DataError
 from training.adapters import trainable_count
 from training.attachment import attach_for_training
@@ -25,15 +25,16 @@ from training.backbone import Backbone
 from training.backbones import load_backbone
 from training.batches import StepBatches, TrainingBatch, TrainingItems, collate
 from training.checkpoints import check_checkpoint, newest_checkpoint, save_checkpoint
+from training.claims import Claim, sweep
 from training.config import TrainConfig
 from training.draws import keyed_seed
 from training.dry_run import RunPlan, plan_run
 from training.guards import StopFlag, TrainingError, memory_advice, stop_flag
 from training.latent_store import LatentStore
-from training.latents import check_store, manifest_picture, open_store, write_whole
+from training.latents import check_store, manifest_picture, open_store
 from training.prefetch import Prefetched, leave_signals_to_the_trainer
-from training.run_log import RunLog
-from training.run_state import ADAPTER, RunState, config_differences, pack_state, read_state, restore
+from training.run_log import METRICS, RunLog
+from training.run_state import ADAPTER, FILES, RunState, config_differences, pack_state, read_state, restore
 from training.schedule import learning_rate
 from training.validation import held_out_losses, write_validation_videos
 
@@ -87,7 +88,7 @@ def train(
         quiet: no progress line.
 
     Raises:
-        ConfigError: settings that contradict each other or the checkpoint.
+        ConfigError: settings that contradict each other or the checkpoint, or another training that uses ``out``.
         DataError: no latents, stale latents.
         StorageError: no space left, or ``out`` cannot be written to.
         TrainingError: a loss that is no number, no memory left; the last good checkpoint is intact.
@@ -107,13 +108,31 @@ class Trainer:
         self.config, self.out, self.quiet = config, out, quiet
         self.accelerator = _accelerator(config, out)
         self.store = _fitting_store(config, data)
+        # One process writes for all.
+        self.claim = Claim(out) if self.accelerator.is_main_process else None
+        try:
+            self._prepare(resume, backbone)
+        except BaseException:
+            self._release()
+            raise
+
+    def _release(self) -> None:
+        if self.claim is not None:
+            self.claim.release()
+
+    def _prepare(self, resume: Resume, backbone: Backbone | None) -> None:
+        """Load the backbone and put it where the run stands."""
+        config = self.config
+        if self.claim is not None:
+            sweep(half for name in (ADAPTER, METRICS) for half in self.out.glob(f".{name}.*"))
         self.backbone = backbone or load_backbone(config.backbone, device=self.accelerator.device)
         if self.accelerator.is_main_process:
             check_store(self.store, config.backbone, vae_fingerprint=self.backbone.fingerprint_vae())
             self.backbone.release(["vae"])
         self.keys = self.store.keys("train")
         self.items = TrainingItems(self.store, self.keys, config)
-        self.parameters = attach_for_training(self.backbone, config)
+        with memory_advice(config):
+            self.parameters = attach_for_training(self.backbone, config)
         self.names = [name for name, one in self.backbone.denoiser.named_parameters() if one.requires_grad]
         self.optimiser = torch.optim.AdamW(
             self.parameters, lr=config.optimiser.learning_rate, betas=config.optimiser.betas,
@@ -128,12 +147,12 @@ class Trainer:
     def _resume(self, resume: Resume) -> int:
         """Steps done, with the adapter and the moments put back."""
         root = self.out / "checkpoints"
-        checkpoint = newest_checkpoint(root) if isinstance(resume, str) else resume
+        checkpoint = newest_checkpoint(root, wanted=FILES) if isinstance(resume, str) else resume
         if checkpoint is None:
             return 0
         if resume == "never":
             raise ConfigError(f"{self.out} already has checkpoints; give another --out, or --resume auto to go on")
-        check_checkpoint(checkpoint)
+        check_checkpoint(checkpoint, wanted=FILES)
         state = read_state(checkpoint)
         changed = config_differences(state.config, self.config)
         if changed:
@@ -165,8 +184,18 @@ class Trainer:
         )  # fmt: skip
 
     def run(self, on_step: Callable[[int, float], None] | None = None) -> TrainSummary:
-        """Train to the last step, or until Ctrl-C."""
+        """Train to the last step, or until Ctrl-C, and give ``out`` free."""
+        try:
+            return self._run(on_step)
+        finally:
+            self._release()
+
+    def _run(self, on_step: Callable[[int, float], None] | None) -> TrainSummary:
         config, start = self.config, self.step
+        if config.trackers:
+            about = {"name": config.name, "stage": config.stage, "seed": config.seed}
+            with storage_errors(self.out):
+                self.accelerator.init_trackers("logs", config=about)
         losses: list[float] = []
         held_out: dict[str, float] = {}
         log = RunLog(
@@ -263,8 +292,7 @@ class Trainer:
         save_checkpoint(self.out / "checkpoints", self.step, files, keep=self.config.checkpoint.keep)
         adapter = files[ADAPTER]
         assert isinstance(adapter, bytes)
-        with storage_errors(self.out):
-            write_whole(self.out / ADAPTER, adapter)
+        atomic_write(self.out / ADAPTER, adapter)
 
     def _validate(self, log: RunLog) -> dict[str, float]:
         values = held_out_losses(self.backbone, self.items, self.store, self.config, accelerator=self.accelerator)
@@ -305,16 +333,10 @@ def _accelerator(config: TrainConfig, out: Path) -> Accelerator:
     if absent:
         raise ConfigError(f"trackers {', '.join(absent)} are not installed; `pip install {' '.join(absent)}`")
     # Precision is the backbone's affair: accelerate would fix it for the whole process, and two runs may differ.
-    accelerator = Accelerator(
+    return Accelerator(
         mixed_precision="no", log_with=list(config.trackers) or None, project_dir=str(out),
         cpu=not torch.cuda.is_available(),
     )  # fmt: skip
-    if config.trackers:
-        if accelerator.is_main_process:
-            make_folder(out)
-        with storage_errors(out):
-            accelerator.init_trackers("logs", config={"name": config.name, "stage": config.stage, "seed": config.seed})
-    return accelerator
 
 
 def _fitting_store(config: TrainConfig, data: Path) -> LatentStore:

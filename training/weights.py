@@ -4,7 +4,7 @@ import contextlib
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,16 @@ from labeling.errors import ModelError
 _HOW_IT_WAS_LOADED = ("dtype", "torch_dtype", "architectures")
 _HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
 _FILES = ("config.json", "*.safetensors")
+TEXT_PARTS = ("tokenizer", "text_encoder")
+"""Of a repository that holds its own text encoder."""
 _WHERE = "`weights` or `text_weights` in a backbone's YAML, see README, Real weights"
 _SINGLE_FILE_ADVICE = "set backbone.weights_config to a diffusers folder whose configurations fit it"
 
 
 def load_pretrained(
-    kind: Any, source: str, subfolder: str, *, dtype: torch.dtype, file_config: str | None = None
-) -> Any:
+    kind: Any, source: str, subfolder: str, *, dtype: torch.dtype, file_config: str | None = None,
+    needed: Sequence[str] = (),
+) -> Any:  # fmt: skip
     """A diffusers model from a folder or hub id (its ``subfolder``), or from a single-file checkpoint.
 
     Nothing is downloaded, here and below: a hub id is looked for in the hub's cache.
@@ -33,6 +36,7 @@ def load_pretrained(
         subfolder: the model's part of a folder or hub repository.
         dtype: of the weights in memory.
         file_config: folder or hub id whose configuration a single file fits; None lets diffusers name it.
+        needed: all parts of the repository that the backbone is made of, so that one download is advised.
 
     Raises:
         ModelError: nothing there, or not this class's weights.
@@ -44,14 +48,16 @@ def load_pretrained(
             told = {"config": str(_folder_with(file_config, f"{subfolder}/config.json")), "subfolder": subfolder}
         with _loading(what, source, _SINGLE_FILE_ADVICE):
             return kind.from_single_file(source, torch_dtype=dtype, local_files_only=True, **told)
-    folder = _folder_with(source, *(f"{subfolder}/{name}" for name in _FILES))
+    folder = _folder_with(source, *(f"{subfolder}/{name}" for name in _FILES), needed=needed)
     with _loading(what, source):
         return kind.from_pretrained(
             folder, subfolder=subfolder, torch_dtype=dtype, use_safetensors=True, local_files_only=True
         )
 
 
-def load_text_encoder(source: str, *, dtype: torch.dtype, single_file: bool = False) -> tuple[Any, torch.nn.Module]:
+def load_text_encoder(
+    source: str, *, dtype: torch.dtype, single_file: bool = False, needed: Sequence[str] = ()
+) -> tuple[Any, torch.nn.Module]:
     """(tokenizer, T5 encoder) from the ``tokenizer`` and ``text_encoder`` parts of a folder or hub id, or its root.
 
     Raises:
@@ -67,15 +73,17 @@ def load_text_encoder(source: str, *, dtype: torch.dtype, single_file: bool = Fa
         alone = "t5" in Path(source).name
     else:
         alone = (held / "config.json").is_file() and not (held / "text_encoder").is_dir()
-    tokens, network = ("", "") if alone else ("tokenizer", "text_encoder")
-    folder = _folder_with(source, str(Path(tokens, "tokenizer_config.json")), str(Path(network, "config.json")))
+    tokens, network = ("", "") if alone else TEXT_PARTS
+    folder = _folder_with(
+        source, str(Path(tokens, "tokenizer_config.json")), str(Path(network, "config.json")), needed=needed
+    )
     with _loading("a T5 text encoder", source):
         tokenizer = AutoTokenizer.from_pretrained(folder, subfolder=tokens, local_files_only=True)
         encoder = T5EncoderModel.from_pretrained(folder, subfolder=network, dtype=dtype, local_files_only=True)
     return tokenizer, encoder
 
 
-def load_image_encoder(source: str, *, dtype: torch.dtype) -> torch.nn.Module:
+def load_image_encoder(source: str, *, dtype: torch.dtype, needed: Sequence[str] = ()) -> torch.nn.Module:
     """The CLIP image encoder from the ``image_encoder`` part of a folder or hub id.
 
     Raises:
@@ -84,7 +92,7 @@ def load_image_encoder(source: str, *, dtype: torch.dtype) -> torch.nn.Module:
     from transformers import CLIPVisionModelWithProjection
 
     part = "image_encoder"
-    folder = _folder_with(source, *(f"{part}/{name}" for name in _FILES))
+    folder = _folder_with(source, *(f"{part}/{name}" for name in _FILES), needed=needed)
     with _loading("a CLIP image encoder", source):
         return CLIPVisionModelWithProjection.from_pretrained(folder, subfolder=part, dtype=dtype, local_files_only=True)
 
@@ -101,8 +109,8 @@ def find_folder(source: str) -> Path | None:
         return None
 
 
-def _folder_with(source: str, *wanted: str) -> Path:
-    """The folder of ``source``, which holds the files (glob patterns) that are wanted.
+def _folder_with(source: str, *wanted: str, needed: Sequence[str] = ()) -> Path:
+    """The folder of ``source``, which holds the files (glob patterns) that are wanted; advice is to get all ``needed``.
 
     Raises:
         ModelError: some of them are not there; they are named, and where they may lie.
@@ -118,7 +126,7 @@ def _folder_with(source: str, *wanted: str) -> Path:
         raise ModelError(f"weights {source!r} are no folder and no file; name one that holds {names} ({_WHERE})")
     from huggingface_hub import constants
 
-    parts = dict.fromkeys(one.rpartition("/")[0] for one in lacking)
+    parts = dict.fromkeys([*needed, *(one.rpartition("/")[0] for one in lacking)])
     chosen = "".join(f" --include '{part}/*'" for part in parts if part)
     raise ModelError(
         f"weights {source!r} are not on this machine, and nothing is downloaded: the hub's cache "

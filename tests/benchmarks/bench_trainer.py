@@ -151,8 +151,8 @@ def loader_ms(job: Path) -> float:
 
 def big_sample_ms(folder: Path) -> float:
     """CPU ms per sample at the real sizes: latents of 768x512 and 1056x704 by 121 frames, 128 channels, bfloat16."""
+    from dataset.receipts import atomic_write
     from training.latent_store import CacheManifest, ClipRecord, text_path
-    from training.latents import write_whole
     from training.weights import tensor_bytes
 
     shapes = {"skeleton": (128, 16, 16, 24), "ego": (128, 16, 16, 24), "objects_0": (128, 16, 16, 24)}
@@ -163,7 +163,7 @@ def big_sample_ms(folder: Path) -> float:
     lines = []
     for index in range(8):
         data = tensor_bytes(tensors)
-        write_whole(store_folder / f"clips/v/v_{index}.safetensors", data)
+        atomic_write(store_folder / f"clips/v/v_{index}.safetensors", data)
         record = ClipRecord(
             key=f"v_{index}",
             split="train",
@@ -174,9 +174,9 @@ def big_sample_ms(folder: Path) -> float:
         )
         lines.append(record.line())
     (store_folder / "clips-0of1.jsonl").write_text("".join(lines))
-    write_whole(text_path(store_folder, ""), tensor_bytes({"tokens": torch.zeros(1, 4096)}))
+    atomic_write(text_path(store_folder, ""), tensor_bytes({"tokens": torch.zeros(1, 4096)}))
     manifest = CacheManifest(parts={"vae": ""}, frames=121, fps=24.0, backbone={})
-    write_whole(store_folder / "cache.json", manifest.to_json().encode())
+    atomic_write(store_folder / "cache.json", manifest.to_json().encode())
     from training.latent_store import LatentStore
 
     costs = {}
