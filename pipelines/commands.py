@@ -16,7 +16,7 @@ from labeling.errors import ConfigError
 from labeling.extractors import ExtractorChoice, Extractors, choose_extractors
 from labeling.onnx_model import resolve_providers
 from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, with_effort
-from pipelines.console import ConsoleReporter, counted, print_damaged, print_failures
+from pipelines.console import ConsoleReporter, counted, print_damaged, print_failures, print_twins
 from pipelines.damage import damaged_videos
 from pipelines.engine import Engine
 from pipelines.given_tables import read_cameras, read_split
@@ -253,6 +253,8 @@ def _finish(job: Job, reports: Sequence[StageReport], reporter: ConsoleReporter)
     stages = {report.stage for report in reports}
     if stages & {"index", "cut"}:
         print_damaged(damaged_videos(job), reporter.console)
+    if "select" in stages and (job.root / SELECTION).is_file():
+        print_twins(read_selection(job.root / SELECTION), reporter.console)
     if _is_empty(job, stages):
         reporter.console.print(f"[red]{escape(why_nothing_is_left(job.root))}[/]")
         return 1

@@ -401,10 +401,10 @@ def test_a_list_of_paths_with_ids(run, video, config, tmp_path):
     listed.write_text(f"# two of them\nmine\t{video}\n\n{video}\n")
     table = tmp_path / "leave.csv"
     table.write_text("video_id,start_s,end_s\nmine,0.2,\n")
-    code, _, _ = run(
+    code, out, _ = run(
         "label", listed, "-o", tmp_path / "J", "--config", config, "--keep-share", "1", "--workers", "0",
         "--leave-out", table,
     )  # fmt: skip
-    assert code == 0
+    assert code == 0 and "note street is mine again, byte for byte: its clips are dropped (same_as)" in out
     summary = json.loads(run("inspect", tmp_path / "J", "--json")[1])
-    assert (summary["videos"], summary["kept"], summary["dropped"]) == (2, 3, {"left_out": 1})
+    assert (summary["videos"], summary["kept"], summary["dropped"]) == (2, 1, {"left_out": 1, "same_as": 2})
