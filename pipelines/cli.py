@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from pipelines.cli_errors import USAGE_ERRORS, print_usage_error, refuse_empty_paths
 from pipelines.cli_options import (
     LABEL,
     LOOK,
@@ -42,20 +43,25 @@ def main() -> None:
     from labeling.errors import AnimaticError
 
     try:
-        app()
+        refuse_empty_paths(app, sys.argv[1:])
+        code = app(standalone_mode=False)
     except AnimaticError as error:
         from pipelines.console import print_error
 
         print_error(error)
         sys.exit(2)
-    except SystemExit as stop:
-        # typer makes this of Ctrl-C, without a word.
-        if stop.code == STOPPED:
-            print("stopped; run the same command again to go on", file=sys.stderr)
-        raise
+    except USAGE_ERRORS as error:
+        print_usage_error(error)
+        sys.exit(2)
+    except typer.Abort:
+        sys.exit(1)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    # typer makes this of Ctrl-C, without a word.
+    if code == STOPPED:
+        print("stopped; run the same command again to go on", file=sys.stderr)
+    sys.exit(code if isinstance(code, int) else 0)
 
 
 @app.command(rich_help_panel=LABEL)
