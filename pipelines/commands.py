@@ -141,6 +141,8 @@ def prepare_job(
         parse_part(options.part)
     _refuse_file(out)
     sources = find_videos(videos, out=out) if videos else []
+    if sources:
+        _refuse_other_folder(out)
     job = open_or_create(out, videos=sources, models_dir=options.models, leave_out=options.leave_out)
     config = configured(job.config, options)
     _check_tables(config, list(job.sources))
@@ -158,6 +160,15 @@ def _refuse_file(out: Path) -> None:
     there = next((place for place in (out, *out.parents) if place.exists()), None)
     if there is not None and not there.is_dir():
         raise ConfigError(f"--out {out}: {there} is a file; give a folder that can be written to")
+
+
+def _refuse_other_folder(out: Path) -> None:
+    """A folder of other things (the videos, as a rule) is not to be filled with a job's."""
+    if out.is_dir() and not (out / "job.yaml").is_file():
+        # What another part is just writing begins with a dot.
+        others = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
+        if others:
+            raise ConfigError(f"--out {out}: is no job and not empty (holds {others[0]}); give a job or a new folder")
 
 
 def _check_tables(config: Config, video_ids: Sequence[str]) -> None:
