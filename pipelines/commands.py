@@ -22,6 +22,7 @@ from pipelines.engine import Engine
 from pipelines.given_tables import read_cameras, read_split
 from pipelines.imports import import_trajectories
 from pipelines.job import Job, open_job, open_or_create
+from pipelines.job_changes import job_changes
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
 from pipelines.layout import SELECTION
 from pipelines.models import check_models_folder
@@ -57,7 +58,7 @@ def run_label(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
         AnimaticError: something a person can mend before anything is spent.
     """
     reporter = ConsoleReporter()
-    job = prepare_job(videos, out, options, check=lambda job: check_extractors(job, reporter))
+    job = prepare_job(videos, out, options, check=lambda job: check_extractors(job, reporter), reporter=reporter)
     reports = run_job(job, ALL_STAGES, options, reporter)
     sweep_outdated(job)
     return _finish(job, reports, reporter)
@@ -66,14 +67,14 @@ def run_label(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
 def run_slice(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
     """Index and cut with every clip kept; 0, or 1 where something failed."""
     reporter = ConsoleReporter()
-    job = prepare_job(videos, out, options)
+    job = prepare_job(videos, out, options, reporter=reporter)
     return _finish(job, run_job(job, SLICE_STAGES, options, reporter), reporter)
 
 
 def run_index(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
     """Index, on a new job or one that is there; 0, or 1 where something failed."""
     reporter = ConsoleReporter()
-    job = prepare_job(videos, out, options, check=chosen_cards)
+    job = prepare_job(videos, out, options, check=chosen_cards, reporter=reporter)
     return _finish(job, run_job(job, COMMAND_STAGES["index"], options, reporter), reporter)
 
 
@@ -124,8 +125,9 @@ def run_select(out: Path, *, extend: bool = False, refreeze: bool = False, worke
 
 
 def prepare_job(
-    videos: Sequence[Path], out: Path, options: JobOptions, *, check: Callable[[Job], object] | None = None
-) -> Job:
+    videos: Sequence[Path], out: Path, options: JobOptions, *, check: Callable[[Job], object] | None = None,
+    reporter: ConsoleReporter | None = None,
+) -> Job:  # fmt: skip
     """The job with its settings and videos, written to ``job.yaml``.
 
     Args:
@@ -133,6 +135,7 @@ def prepare_job(
         out: its folder.
         options: on top of the job's settings.
         check: raises for what the command could not use; what cannot be used leaves no ``job.yaml`` behind.
+        reporter: told, before anything is spent, of what changes in a job that is there.
 
     Raises:
         AnimaticError: settings, tables, videos, a part or a folder that cannot be used.
@@ -150,6 +153,8 @@ def prepare_job(
     check_models_folder(options.models)
     if check is not None:
         check(job)
+    if reporter is not None and (out / "job.yaml").is_file() and (words := job_changes(open_job(out), job)):
+        reporter.console.print(f"[bold]{'job':>10}[/] {escape(f'{out}: {words}')}")
     make_folder(out)
     job.save()
     return job

@@ -23,6 +23,7 @@ from pipelines.layout import SELECTION, SHARD_INDEX
 from pipelines.next_training import next_training
 from pipelines.nothing_left import clips_packed, why_nothing_is_left
 from pipelines.stage import COMMAND_STAGES, item_state
+from pipelines.stale_shards import print_stale_shards
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -251,6 +252,7 @@ def _print_summary(root: Path, summary: Summary) -> None:
     if (root / "job.yaml").is_file():
         print_damaged(damaged_videos(open_job(root)), console)
     print_black_skeletons(root, console)
+    print_stale_shards(root, console)
     if sum(summary.packed.values()):
         console.print(f"one clip: [bold]animatic inspect {root} {_some_key(root)} --sheet sheet.png[/]")
     elif not summary.kept or (root / SHARD_INDEX).is_file():

@@ -162,6 +162,31 @@ def test_a_finished_job_is_labelled_again_at_once(run, job):
     assert code == 0 and not re.search(r"[1-9]\d* done", out)
 
 
+def test_what_changes_in_a_job_is_said_before_work_starts(run, video, job, tmp_path):
+    root = shutil.copytree(job, tmp_path / "J")
+    more = write_street(tmp_path / "more.mp4", frames=24, seed=3)
+    code, out, _ = run("index", more, "--out", root, "--keep-share", "0.9", "--extractors", "street", "--workers", "0")
+    words = (
+        f"{root}: adds 1 video to 1; select.keep_share 1.0 -> 0.9, keypoints.extractors none -> street: what depends "
+    )
+    assert code == 0 and words in out.splitlines()[0]
+    stale = "note shards are older than the job's settings, videos or models"
+    assert stale in run("inspect", root)[1] and stale not in run("inspect", job)[1]
+    assert stale in run("cache", root, "--backbone", "nope")[1]
+    assert stale in run("train", "motion", "--data", root, "--config", "motion_ltx_2b", "--dry-run")[1]
+    assert (
+        "effort balanced -> fast: what depends on it" in run("index", "-o", root, "--config", fast(tmp_path, root))[1]
+    )
+    assert "adds" not in run("index", "-o", root)[1]
+
+
+def fast(folder, job):
+    """The settings of a job with another effort."""
+    config = yaml.safe_load((job / "job.yaml").read_text())["config"]
+    changed = {"keypoints": {**config["keypoints"], "effort": "fast"}, "count": {"looks_per_clip": 1}}
+    return bad_yaml(folder, yaml.safe_dump(config | changed))
+
+
 def test_inspect_gives_a_summary_a_record_and_a_sheet(run, job, tmp_path):
     code, out, _ = run("inspect", job)
     assert code == 0 and "2, kept 2 (no threshold), packed 2" in out and "1 video, " in out
