@@ -15,7 +15,7 @@ from dataset.pictures import write_picture
 from dataset.receipts import read_receipts, reason_counts
 from dataset.selection import read_selection
 from labeling.errors import AnimaticError, ConfigError, DataError
-from pipelines.black_skeletons import print_black_skeletons
+from pipelines.black_skeletons import black_skeletons, print_black_skeletons
 from pipelines.console import counted, dropped_words, file_size, make_console, print_damaged, shortened
 from pipelines.damage import damaged_videos
 from pipelines.job import Job, open_job
@@ -71,7 +71,7 @@ def job_status(root: Path) -> JobStatus:
     job = open_job(root)
     stages = tuple(stage_status(job, name) for names in COMMAND_STAGES.values() for name in names)
     empty = why_nothing_is_left(root) if _is_through(stages) and clips_packed(job) == 0 else ""
-    command, reason = _next(root, stages, empty=bool(empty))
+    command, reason = _next(job, stages, empty=bool(empty))
     return JobStatus(
         root=str(root), videos=len(job.sources), stages=stages, clips=_selected(root),
         damaged=tuple(damaged_videos(job)), nothing_left=empty, next_command=command, next_reason=reason,
@@ -109,8 +109,9 @@ def _is_through(stages: tuple[StageStatus, ...]) -> bool:
     return not any(stage.items is None or stage.pending or stage.retryable for stage in stages)
 
 
-def _next(root: Path, stages: tuple[StageStatus, ...], *, empty: bool) -> tuple[str, str]:
+def _next(job: Job, stages: tuple[StageStatus, ...], *, empty: bool) -> tuple[str, str]:
     """What to type next, and why."""
+    root = job.root
     again = f"animatic label --out {root}"
     for stage in stages:
         if stage.retryable:
@@ -122,6 +123,9 @@ def _next(root: Path, stages: tuple[StageStatus, ...], *, empty: bool) -> tuple[
     if empty:
         return again, "with other settings or videos: no clip is left"
     if stages[-1].done and (root / SHARD_INDEX).is_file():
+        # A person who has cached latents all the same may have other control videos.
+        if black_skeletons(job) and not any((root / "latents").glob("*/cache.json")):
+            return "animatic models", f"to get a keypoint network: without one skeletons are black; then `{again}`"
         return next_training(root)
     return again, "nothing is packed yet"
 

@@ -15,6 +15,7 @@ from pipeline_fixtures import SMALL, write_detector, write_street
 from safetensors.numpy import save_file
 
 from pipelines.cli import main
+from pipelines.next_training import next_training
 from training.adapter_notes import OUR_METADATA
 
 
@@ -89,11 +90,22 @@ def test_python_runs_the_modules_as_the_command(module):
 
 def test_status_of_a_finished_job(run, job):
     code, out, _ = run("status", job)
-    assert code == 0 and f"next: animatic cache {job} --backbone ltx-2b  (2 clips packed, which `animatic insp" in out
+    assert code == 0 and "next: animatic models  (to get a keypoint network: without one skeletons are black" in out
     assert f"{job}: 1 video\n" in out and "clips: 2 kept\n" in out
     code, out, _ = run("status", job, "--json")
     stages = {stage["stage"]: stage for stage in json.loads(out)["stages"]}
     assert stages["cut"]["done"] == 1 and stages["render"]["done"] == 2 and not stages["pack"]["failed"]
+
+
+def test_a_backbone_that_needs_no_weights_is_named_where_those_of_the_first_are_not_there(job, tmp_path, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    command, reason = next_training(job)
+    assert command == f"animatic cache {job} --backbone ltx-2b" and reason.startswith("2 clips packed, which `animatic")
+    assert "`--backbone tiny` tries all steps without any" in reason
+    weights = tmp_path / "models--Lightricks--LTX-Video" / "snapshots" / "0" / "model_index.json"
+    weights.parent.mkdir(parents=True)
+    weights.touch()
+    assert "`--backbone tiny`" not in next_training(job)[1]
 
 
 def test_status_goes_on_to_training(run, job, tmp_path):
