@@ -1,7 +1,7 @@
 """What the labelling commands do: settings from options, a job, its stages, and an exit code."""
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -197,24 +197,31 @@ def configured(config: Config, options: JobOptions) -> Config:
         if options.effort not in EFFORTS:
             raise ConfigError(f"--effort {options.effort!r} is not known; choose one of {', '.join(EFFORTS)}")
         config = with_effort(config, next(effort for effort in EFFORTS if effort == options.effort))
-    changes: dict[str, Any] = {}
-    if options.keep_share is not None:
-        changes["select"] = {"keep_share": options.keep_share}
-    if options.split is not None:
-        changes.setdefault("select", {})["split"] = read_split(options.split)
-    if options.cameras is not None:
-        changes["cameras"] = read_cameras(options.cameras)
-    if options.extractors is not None:
-        names = [name.strip() for name in options.extractors.split(",") if name.strip()]
-        changes["keypoints"] = {"extractors": names}
-    if options.videos is not None:
-        changes["pack"] = {"videos": options.videos}
-    if options.captions is not None:
-        changes["views"] = {"captions": str(absolute(options.captions))}
-    config = merged(config, changes) if changes else config
+    for option, changes in _option_changes(options):
+        try:
+            config = merged(config, changes)
+        except ConfigError as error:
+            raise ConfigError(f"{option}: {str(error).removeprefix('settings: ')}") from error
     if config.views.captions is not None:
         read_caption_table(Path(config.views.captions))
     return config
+
+
+def _option_changes(options: JobOptions) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Each option that stands for a setting, as it was typed, with what it changes."""
+    if options.keep_share is not None:
+        yield f"--keep-share {options.keep_share:g}", {"select": {"keep_share": options.keep_share}}
+    if options.split is not None:
+        yield f"--split {options.split}", {"select": {"split": read_split(options.split)}}
+    if options.cameras is not None:
+        yield f"--cameras {options.cameras}", {"cameras": read_cameras(options.cameras)}
+    if options.extractors is not None:
+        names = [name.strip() for name in options.extractors.split(",") if name.strip()]
+        yield f"--extractors {options.extractors}", {"keypoints": {"extractors": names}}
+    if options.videos is not None:
+        yield f"--videos {options.videos}", {"pack": {"videos": options.videos}}
+    if options.captions is not None:
+        yield f"--captions {options.captions}", {"views": {"captions": str(absolute(options.captions))}}
 
 
 def check_extractors(job: Job, reporter: ConsoleReporter) -> None:
