@@ -246,12 +246,13 @@ def inspect(
     trajectory: Annotated[
         Path | None, typer.Option(help="Write the clip's way from above, its speed and yaw rate here (.png).")
     ] = None,
+    keys: Annotated[bool, typer.Option("--keys", help="List the packed clips, each with its split.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """The dataset in numbers, or one clip's record, contact sheet and trajectory."""
     from pipelines.status import inspect as inspect_job
 
-    raise typer.Exit(inspect_job(job, key, sheet=sheet, trajectory=trajectory, as_json=as_json))
+    raise typer.Exit(inspect_job(job, key, sheet=sheet, trajectory=trajectory, as_json=as_json, keys=keys))
 
 
 @app.command(rich_help_panel=LOOK)
@@ -320,7 +321,7 @@ def export_coco(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for the JSON file, and with --images for its pictures.")
     ],
-    split: Annotated[str, typer.Option(help="train or val.")] = "train",
+    split: Annotated[str | None, typer.Option(help="train or val; by default both.")] = None,
     images: Annotated[
         bool, typer.Option("--images", help="Write the frames that the file names as JPEG files too.")
     ] = False,

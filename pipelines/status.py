@@ -9,8 +9,16 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from dataset.inspection import Spread, Summary, clip_record, contact_sheet, drop_reasons, find_sample, summarize
-from dataset.loader import ShardDataset
+from dataset.inspection import (
+    Spread,
+    Summary,
+    clip_record,
+    contact_sheet,
+    drop_reasons,
+    find_sample,
+    packed_keys,
+    summarize,
+)
 from dataset.pictures import write_picture
 from dataset.receipts import read_receipts, reason_counts
 from dataset.selection import read_selection
@@ -189,13 +197,25 @@ def failure_lines(root: Path, *, most: int = 20) -> list[str]:
 
 
 def inspect(
-    root: Path, key: str | None, *, sheet: Path | None = None, trajectory: Path | None = None, as_json: bool = False
-) -> int:
-    """The dataset's summary, or a clip's record, contact sheet and trajectory.
+    root: Path, key: str | None, *, sheet: Path | None = None, trajectory: Path | None = None, as_json: bool = False,
+    keys: bool = False,
+) -> int:  # fmt: skip
+    """The dataset's summary, a clip's record, contact sheet and trajectory, or the packed clips' keys.
 
     Raises:
         AnimaticError: no job, no such clip, a clip that was dropped, or a picture that cannot be written.
     """
+    if keys:
+        if key is not None or sheet is not None or trajectory is not None:
+            raise ConfigError("--keys lists all packed clips; give it without a clip and without pictures")
+        by_split = packed_keys(root)
+        if as_json:
+            print_json(by_split)
+            return 0
+        for split, packed in by_split.items():
+            for one in packed:
+                print(f"{one}\t{split}")
+        return 0
     if key is None:
         if sheet is not None or trajectory is not None:
             option = "--sheet" if sheet is not None else "--trajectory"
@@ -223,7 +243,7 @@ def inspect(
 
 
 def _some_key(root: Path) -> str:
-    keys = [key for split in ("train", "val") for key in ShardDataset(root, split).keys]
+    keys = [key for packed in packed_keys(root).values() for key in packed]
     return keys[0] if keys else "<video_id>_<start_frame>"
 
 

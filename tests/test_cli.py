@@ -210,6 +210,9 @@ def test_inspect_gives_a_summary_a_record_and_a_sheet(run, job, tmp_path):
     assert sheet is not None and sheet.shape[1] > 2000
     code, out, _ = run("inspect", job, "street_8", "--trajectory", tmp_path / "t.png")
     assert code == 0 and "trajectory:" in out and (tmp_path / "t.png").is_file()
+    assert run("inspect", job, "--keys") == (0, "street_0\ttrain\nstreet_8\ttrain\n", "")
+    assert json.loads(run("inspect", job, "--keys", "--json")[1]) == {"train": ["street_0", "street_8"], "val": []}
+    assert run("inspect", job, "street_8", "--keys")[0] == 2
     assert json.loads(run("inspect", job, "--json")[1])["packed"] == {"train": 2, "val": 0}
 
 
@@ -231,6 +234,10 @@ def test_the_released_trainer_s_manifest(run, job, tmp_path):
     assert all(set(line) == {"id", "caption", "rgb_path", "pose_path"} for line in lines)
     assert {frame_count(line[name]) for line in lines for name in ("rgb_path", "pose_path")} == {9}
     assert run("export", "released", job, "--out", tmp_path, "--split", "val")[0] == 2
+    for form in ("released", "coco"):
+        code, _, err = run("export", form, job, "--out", job / "videos" / "..")
+        assert code == 2 and "is the job's own folder; give another" in err
+    assert not list(job.glob("*.json*")) and not (job / "rgb").exists()
 
 
 def test_keypoints_as_coco(run, job, tmp_path):
