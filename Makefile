@@ -7,7 +7,7 @@ TEST_WORKERS ?= 2
 # What street-models trains on: cpu, or cuda with many cores beside it.
 DEVICE ?= cpu
 
-.PHONY: setup demo test lint check street-models benchmarks clean
+.PHONY: setup demo test lint check street-models clean
 
 setup: $(READY)
 

@@ -1,33 +1,22 @@
-"""Looking at a dataset: its summary in numbers, a clip's record, and a clip as a contact sheet."""
+"""Looking at a dataset: its summary in numbers, and a clip's record."""
 
-import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
+from dataset.layout import RECEIPTS, SELECTION, SHARD_INDEX
 from dataset.loader import Sample, ShardDataset
 from dataset.receipts import Receipt, read_receipts, reason_counts
 from dataset.selection import ClipRow, Selection, read_selection
 from dataset.shards import read_shard_index
 from labeling.errors import DataError
 from labeling.labels import Keypoints
-from labeling.object_video import MOST_TRACKS, tracks_of
-
-SHEET_ROWS = {"rgb.mp4": "RGB", "skeleton.mp4": "skeleton", "ego.mp4": "ego", "objects.mp4": "objects"}
-"""The videos of a sheet from the top, and what they are called."""
 
 _FPS = 24
-_MOMENTS = 8
-_TILE = (264, 176)
-_GAP, _GUTTER, _TIMES = 6, 92, 26
-_GROUND, _INK, _FAINT = "#14171c", "#f2f4f7", "#9aa4b2"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,13 +76,13 @@ def summarize(job: Path) -> Summary:
     Raises:
         DataError: the folder holds no selection yet.
     """
-    if not (job / "selection.parquet").is_file():
+    if not (job / SELECTION).is_file():
         raise DataError(f"{job}: holds no selection; make one with `animatic label VIDEO... --out {job}`")
-    selection = read_selection(job / "selection.parquet")
+    selection = read_selection(job / SELECTION)
     # By the stages that there are receipts of: which there may be is for the pipeline to know.
-    logged = {folder.name for folder in (job / "receipts").glob("*") if folder.is_dir()}
+    logged = {folder.name for folder in (job / RECEIPTS).glob("*") if folder.is_dir()}
     receipts = {stage: read_receipts(job, stage) for stage in sorted(logged | {"index", "render"})}
-    index_file = job / "shards" / "index.parquet"
+    index_file = job / SHARD_INDEX
     rows = read_shard_index(index_file) if index_file.is_file() else []
     lengths = {row.key: row.end - row.start for row in selection.rows}
     splits = {row.key: row.split for row in rows}
@@ -121,7 +110,7 @@ def drop_reasons(job: Path) -> dict[str, str]:
     Raises:
         DataError: the folder holds no selection.
     """
-    return _drop_reasons(read_selection(job / "selection.parquet"), read_receipts(job, "render"))
+    return _drop_reasons(read_selection(job / SELECTION), read_receipts(job, "render"))
 
 
 def _drop_reasons(selection: Selection, rendered: Mapping[str, Receipt]) -> dict[str, str]:
@@ -151,7 +140,7 @@ def clip_verdict(job: Path, key: str) -> ClipRow:
     Raises:
         DataError: no clip has that key.
     """
-    rows = read_selection(job / "selection.parquet").rows
+    rows = read_selection(job / SELECTION).rows
     for row in rows:
         if row.key == key:
             return row
@@ -172,7 +161,7 @@ def packed_keys(job: Path) -> dict[str, list[str]]:
 
 
 def _has_shards(job: Path) -> bool:
-    return (job / "shards" / "index.parquet").is_file()
+    return (job / SHARD_INDEX).is_file()
 
 
 def find_sample(job: Path, key: str | None = None) -> Sample:
@@ -185,7 +174,7 @@ def find_sample(job: Path, key: str | None = None) -> Sample:
     for dataset in datasets:
         if key in dataset.keys or (key is None and len(dataset)):
             return dataset.sample(key or dataset.keys[0])
-    if key is not None and (job / "selection.parquet").is_file():
+    if key is not None and (job / SELECTION).is_file():
         row, rendered = clip_verdict(job, key), read_receipts(job, "render").get(key)
         reason = row.reason or (rendered and (rendered.reason or rendered.message)) or "it is not packed yet"
         raise DataError(f"{key}: is not in the shards: {reason}; `animatic status {job}` says more")
@@ -204,77 +193,3 @@ def clip_record(sample: Sample) -> dict[str, Any]:
 
 def _label_counts(labels: Sequence[Keypoints]) -> dict[str, int]:
     return dict(sorted(Counter(label.category for label in labels).items()))
-
-
-def contact_sheet(sample: Sample, *, moments: int = _MOMENTS) -> np.ndarray:
-    """A clip at a glance: moments across, its videos below one another, the caption on top.
-
-    Returns:
-        (H, W, 3) uint8 RGB.
-    """
-    suffixes = [suffix for suffix in SHEET_ROWS if suffix in sample.members]
-    rows = [moment_frames(sample, suffix, moments) for suffix in suffixes]
-    tiles = [[_tile(frame) for _, frame in row] for row in rows]
-    times = [index / _FPS for index, _ in rows[0]]
-    caption = textwrap.wrap(sample.caption, width=150)
-    width = _GUTTER + moments * (_TILE[0] + _GAP) + _GAP
-    head = 44 + 22 * len(caption)
-    height = head + _TIMES + len(rows) * (_TILE[1] + _GAP) + _GAP
-    canvas = np.full((height, width, 3), tuple(int(_GROUND[i : i + 2], 16) for i in (1, 3, 5)), np.uint8)
-    for number, row in enumerate(tiles):
-        top = head + _TIMES + number * (_TILE[1] + _GAP)
-        for column, tile in enumerate(row):
-            left = _GUTTER + column * (_TILE[0] + _GAP)
-            canvas[top : top + _TILE[1], left : left + _TILE[0]] = tile
-    texts = [(_GAP * 2, 30.0, sample.key, 15.0, _INK, "left")]
-    texts += [(_GAP * 2, 56.0 + 22 * n, line, 11.0, _INK, "left") for n, line in enumerate(caption)]
-    centre = _TILE[0] / 2
-    texts += [
-        (_GUTTER + n * (_TILE[0] + _GAP) + centre, head + _TIMES - 8.0, f"{time:.2f} s", 9.0, _FAINT, "center")
-        for n, time in enumerate(times)
-    ]
-    for n, suffix in enumerate(suffixes):
-        middle = head + _TIMES + n * (_TILE[1] + _GAP) + _TILE[1] / 2
-        texts.append((_GUTTER - 10.0, middle + 4, SHEET_ROWS[suffix], 10.5, _FAINT, "right"))
-        if suffix == "objects.mp4" and (tracks := len(tracks_of(sample.keypoints()))) > MOST_TRACKS:
-            # Rare traffic and a random choice of dense traffic look the same.
-            texts.append((_GUTTER - 10.0, middle + 20, f"{MOST_TRACKS} of {tracks}", 8.5, _FAINT, "right"))
-    if "skeleton.mp4" in suffixes and not any(label.present.any() for label in sample.keypoints()):
-        middle = head + _TIMES + (suffixes.index("skeleton.mp4") + 0.5) * (_TILE[1] + _GAP)
-        note = "no keypoints: no keypoint network's weights were there, so there is nothing to draw"
-        texts.append((_GUTTER + (width - _GUTTER) / 2, middle, note, 11.0, _FAINT, "center"))
-    return _with_texts(canvas, texts)
-
-
-def moment_frames(sample: Sample, suffix: str, moments: int) -> list[tuple[int, np.ndarray]]:
-    """Frames spread evenly over a clip's video, its first and last among them, with their indices."""
-    count = len(sample.cam_to_world)
-    wanted = [round(index) for index in np.linspace(0, count - 1, moments)]
-    found = {index: frame for index, frame in enumerate(sample.iterate_frames(suffix)) if index in set(wanted)}
-    return [(index, found[index]) for index in wanted]
-
-
-def _tile(frame: np.ndarray) -> np.ndarray:
-    """A frame shrunk to fit a tile, on black."""
-    scale = min(_TILE[0] / frame.shape[1], _TILE[1] / frame.shape[0])
-    size = (max(1, round(frame.shape[1] * scale)), max(1, round(frame.shape[0] * scale)))
-    shrunk = cv2.resize(frame, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
-    tile = np.zeros((_TILE[1], _TILE[0], 3), np.uint8)
-    top, left = (_TILE[1] - size[1]) // 2, (_TILE[0] - size[0]) // 2
-    tile[top : top + size[1], left : left + size[0]] = shrunk
-    return tile
-
-
-def _with_texts(canvas: np.ndarray, texts: Sequence[tuple[float, float, str, float, str, str]]) -> np.ndarray:
-    """Texts (x, y of the baseline, text, points, colour, side) on a picture, pixel for pixel."""
-    height, width = canvas.shape[:2]
-    dpi = 100
-    figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi)
-    painter = FigureCanvasAgg(figure)
-    figure.figimage(canvas)
-    for x, y, text, points, colour, side in texts:
-        figure.text(
-            x / width, 1 - y / height, text.replace("$", r"\$"), fontsize=points, color=colour, ha=side, va="baseline"
-        )
-    painter.draw()
-    return np.asarray(painter.buffer_rgba())[..., :3].copy()

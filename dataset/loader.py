@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from dataset.layout import INDEX_NAME
 from dataset.shards import Member, find_shards, iterate_keys, read_member, read_shard_index
 from dataset.tables import keypoints_from_table
 from labeling.errors import DataError
@@ -90,7 +91,7 @@ class ShardDataset:
     def __init__(self, job_or_shards: Path | str, split: str = "train") -> None:
         self.folder = find_shards(Path(job_or_shards))
         self.split = split
-        rows = read_shard_index(self.folder / "index.parquet")
+        rows = read_shard_index(self.folder / INDEX_NAME)
         self.keys: list[str] = list(iterate_keys(rows, split))
         self._members: dict[str, dict[str, Member]] = {key: {} for key in self.keys}
         for row in rows:

@@ -6,6 +6,7 @@ staged, checked, synced and renamed; so a job that is killed anywhere and starte
 
 import contextlib
 import errno
+import functools
 import hashlib
 import json
 import os
@@ -14,16 +15,24 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, get_args
 
+from dataset.layout import RECEIPTS
 from labeling.errors import DataError, StorageError
 
 State = Literal["done", "dropped", "failed"]
 
 _STORAGE_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.ENOTDIR, errno.EACCES, errno.EPERM,
                    errno.EIO, errno.ESTALE, errno.ENAMETOOLONG, errno.EEXIST, errno.EISDIR}  # fmt: skip
+
+
+class AlteredError(DataError):
+    """A file that is not as its receipt says. Once it is removed it is made again, and then what failed by it."""
+
+    reason: ClassVar[str] = "altered"
+    retryable: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,7 +170,7 @@ class ReceiptLog:
     """One worker's own log of one stage."""
 
     def __init__(self, job: Path, stage: str, *, worker: str | None = None) -> None:
-        self._path = job / "receipts" / stage / f"{worker or worker_name()}.jsonl"
+        self._path = job / RECEIPTS / stage / f"{worker or worker_name()}.jsonl"
 
     def append(self, receipt: Receipt) -> None:
         """Append one line and sync it; a line that cannot be written whole is taken back.
@@ -207,7 +216,7 @@ def read_receipts(job: Path, stage: str) -> dict[str, Receipt]:
         DataError: a whole line is no receipt.
     """
     latest: dict[str, Receipt] = {}
-    for path in sorted((job / "receipts" / stage).glob("*.jsonl")):
+    for path in sorted((job / RECEIPTS / stage).glob("*.jsonl")):
         for receipt in _read_log(path):
             known = latest.get(receipt.item)
             if known is None or (receipt.turn, receipt.state == "done") >= (known.turn, known.state == "done"):
@@ -219,11 +228,28 @@ def _read_log(path: Path) -> Iterable[Receipt]:
     *whole, _torn = path.read_bytes().split(b"\n")
     for number, line in enumerate(whole, start=1):
         try:
-            fields = json.loads(line)
-            fields["outputs"] = tuple(Output(**output) for output in fields["outputs"])
-            yield Receipt(**fields)
-        except (ValueError, TypeError, KeyError) as error:
+            yield _receipt(line)
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise DataError(f"{path}:{number}: is no receipt ({error}); move the line away and run again") from error
+
+
+_KINDS: dict[str, type | tuple[type, ...]] = {
+    "turn": int, "size": int, "retryable": bool, "seconds": (int, float), "outputs": tuple, "facts": dict
+}  # fmt: skip
+"""Types of a record's fields; the others are texts."""
+
+
+def _receipt(line: bytes) -> Receipt:
+    values = json.loads(line)
+    receipt = Receipt(**{**values, "outputs": tuple(Output(**output) for output in values["outputs"])})
+    for record in (receipt, *receipt.outputs):
+        for name in (one.name for one in fields(record)):
+            value = getattr(record, name)
+            if not isinstance(value, _KINDS.get(name, str)):
+                raise TypeError(f"{name} is {value!r}")
+    if receipt.state not in get_args(State):
+        raise ValueError(f"state is {receipt.state!r}")
+    return receipt
 
 
 def publish(staging: Path, job: Path, names: Sequence[str]) -> tuple[Output, ...]:
@@ -265,6 +291,29 @@ def outputs_present(job: Path, receipt: Receipt) -> bool:
         except OSError:
             return False
     return True
+
+
+def check_unaltered(path: Path, sha256: str) -> None:
+    """That a file still has the content that its receipt names: sizes alone do not tell what a bad disk did to it.
+
+    It costs one reading of the file in each process that uses it, which will read it anyway: a gigabyte a second or so.
+
+    Raises:
+        AlteredError: it has another content.
+        OSError: it cannot be read.
+    """
+    status = path.stat()
+    found = _sha256_of(path, status.st_size, status.st_mtime_ns)
+    if found != sha256:
+        raise AlteredError(
+            f"{path}: was altered or damaged after it was made (its sha256 is {found[:12]}..., its receipt says "
+            f"{sha256[:12]}...); remove it and run again"
+        )
+
+
+@functools.lru_cache(maxsize=4096)
+def _sha256_of(path: Path, size: int, modified_ns: int) -> str:
+    return sha256_file(path)
 
 
 def atomic_write(path: Path, data: bytes | Iterable[bytes]) -> None:

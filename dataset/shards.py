@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from dataset.layout import INDEX_NAME, SHARD_INDEX, SHARDS
 from dataset.receipts import storage_errors
 from dataset.tables import SHARD_INDEX_SCHEMA, read_table, table_of, write_table
 from labeling.errors import DataError
@@ -139,9 +140,12 @@ def read_shard_index(path: Path) -> list[Member]:
     """The rows of ``index.parquet``, in order.
 
     Raises:
-        DataError: the file is missing, has other columns, or names that lead out of a folder.
+        DataError: the file is missing, has other columns or empty fields, or names that lead out of a folder.
     """
-    rows = [Member(**row) for row in read_table(path, SHARD_INDEX_SCHEMA)[0].to_pylist()]
+    table, _ = read_table(path, SHARD_INDEX_SCHEMA)
+    if any(column.null_count for column in table.columns):
+        raise DataError(f"{path}: has rows with empty fields; remove it and run pack again, or copy it again")
+    rows = [Member(**row) for row in table.to_pylist()]
     for row in rows:
         # Shards come from others too: a shard is opened by its name, and an export calls files by their keys.
         if not _KEY.fullmatch(row.key) or not _FILE_NAME.fullmatch(row.shard):
@@ -158,26 +162,37 @@ def find_shards(job_or_shards: Path) -> Path:
     Raises:
         DataError: neither holds one.
     """
-    for folder in (job_or_shards, job_or_shards / "shards"):
-        if (folder / "index.parquet").is_file():
+    for folder in (job_or_shards, job_or_shards / SHARDS):
+        if (folder / INDEX_NAME).is_file():
             return folder
-    raise DataError(f"{job_or_shards}: holds no shards/index.parquet; run `animatic label` or `animatic pack` first")
+    raise DataError(f"{job_or_shards}: holds no {SHARD_INDEX}; run `animatic label` or `animatic pack` first")
 
 
 def read_member(folder: Path, row: Member) -> bytes:
     """A member's bytes, by one seek.
 
+    They are hashed at each reading, a gigabyte a second or so: what decodes them would crash on damage, or not see it.
+
     Raises:
-        DataError: the shard is missing or too short.
+        DataError: the shard is missing or too short, or the member has other bytes than were packed.
     """
-    path = folder / row.shard
+    path, name = folder / row.shard, f"{row.key}.{row.member}"
+    again = "copy it again, or remove it and run pack again"
     try:
         with path.open("rb") as stream:
-            data = os.pread(stream.fileno(), row.size, row.offset)
+            # Of a size that a damaged index claims, no buffer is made.
+            whole = row.offset + row.size <= os.fstat(stream.fileno()).st_size
+            data = os.pread(stream.fileno(), row.size, row.offset) if whole else b""
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error}); copy the shard here or run pack again") from error
+        raise DataError(f"{path}: cannot be read ({error}); {again}") from error
     if len(data) != row.size:
-        raise DataError(f"{path}: ends inside {row.key}.{row.member}; copy the shard again or run pack again")
+        raise DataError(f"{path}: ends inside {name} (bytes {row.offset} to {row.offset + row.size}); {again}")
+    found = hashlib.sha256(data).hexdigest()
+    if found != row.sha256:
+        raise DataError(
+            f"{path}: {name} is not as it was packed (its sha256 is {found[:12]}..., the index says "
+            f"{row.sha256[:12]}...); {again}"
+        )
     return data
 
 

@@ -100,24 +100,36 @@ def write_table(path: Path, table: pa.Table, *, metadata: Mapping[str, Any] | No
     pq.write_table(table, path, compression="zstd", row_group_size=max(1, table.num_rows))
 
 
-def read_table(path: Path, schema: pa.Schema) -> tuple[pa.Table, dict[str, Any]]:
-    """The table at ``path`` and its metadata.
+def read_table(path: Path, schema: pa.Schema, *, needs: Sequence[str] = ()) -> tuple[pa.Table, dict[str, Any]]:
+    """The table at ``path`` and its metadata, which must have the keys ``needs``.
 
     Raises:
-        DataError: the file is missing, no Parquet, or has other columns than ``schema``.
+        DataError: the file is missing, no Parquet, has other columns than ``schema``, or metadata that is not ours.
     """
     if not path.is_file():
         raise DataError(f"{path}: is not there; name the job's folder, or run the stage that writes this table")
     try:
         table = pq.read_table(path, use_threads=False)
+        table.validate(full=True)
     except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{path}: cannot be read as a table ({error}); run the stage that writes it again") from error
+        raise DataError(f"{path}: cannot be read as a table ({error}); remove it and run again") from error
     found = {field.name: field.type for field in table.schema}
     wanted = {field.name: field.type for field in schema}
     if found != wanted:
-        raise DataError(f"{path}: needs columns {_columns(wanted)}, has {_columns(found)}; run its stage again")
+        raise DataError(f"{path}: needs columns {_columns(wanted)}, has {_columns(found)}; remove it and run again")
     raw = table.schema.metadata or {}
-    return table, {k.decode(): json.loads(v) for k, v in raw.items() if not k.startswith((b"ARROW", b"pandas"))}
+    try:
+        metadata = {k.decode(): json.loads(v) for k, v in raw.items() if not k.startswith((b"ARROW", b"pandas"))}
+    except (ValueError, RecursionError) as error:
+        raise _foreign(path, f"metadata that is no JSON ({error})") from error
+    missing = [key for key in needs if key not in metadata]
+    if missing:
+        raise _foreign(path, f"no {', '.join(missing)} in its metadata")
+    return table, metadata
+
+
+def _foreign(path: Path, what: str) -> DataError:
+    return DataError(f"{path}: has {what}, as if another tool had rewritten it; remove it and run again")
 
 
 def table_of(schema: pa.Schema, rows: Sequence[Mapping[str, Any]]) -> pa.Table:
@@ -152,7 +164,7 @@ def write_index(path: Path, index: VideoIndex) -> None:
 
 def read_index(path: Path) -> VideoIndex:
     """A video's packet times."""
-    table, metadata = read_table(path, INDEX_SCHEMA)
+    table, metadata = read_table(path, INDEX_SCHEMA, needs=("info", "sha256"))
     return VideoIndex(
         times_s=_column(table, "time_s"), is_keyframe=_column(table, "is_keyframe"),
         info=metadata["info"], sha256=metadata["sha256"],
@@ -290,7 +302,11 @@ def write_ego(
 
 def read_ego(path: Path) -> EgoTable:
     """A run's camera motion."""
-    table, metadata = read_table(path, EGO_SCHEMA)
+    table, metadata = read_table(path, EGO_SCHEMA, needs=("intrinsics", "road"))
+    try:
+        intrinsics = Intrinsics(**metadata["intrinsics"])
+    except TypeError as error:
+        raise _foreign(path, f"other intrinsics in its metadata than ours ({error})") from error
     poses = np.asarray(table["cam_to_world"].combine_chunks().flatten(), dtype=np.float64).reshape(-1, 4, 4)
     return EgoTable(
         frame=_column(table, "frame"),
@@ -299,7 +315,7 @@ def read_ego(path: Path) -> EgoTable:
         confidence=_column(table, "confidence"),
         scale_source=table["scale_source"].to_pylist(),
         scale_sigma=_column(table, "scale_sigma"),
-        intrinsics=Intrinsics(**metadata["intrinsics"]),
+        intrinsics=intrinsics,
         road=metadata["road"],
     )
 

@@ -6,10 +6,12 @@ from the last look to the first, in which only believed tracks begin and what no
 """
 
 from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from labeling.box_tracker import BoxTracker, TrackerSettings
+from labeling.carrying import interpolate_gap
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.schemas import Category
 from labeling.tracking import TrackedLook
@@ -31,7 +33,8 @@ def reach_back(
         categories: which have boxes to be associated by.
 
     Returns:
-        Labels with the ids of the tracks that they belong to, none of which has another label in its look.
+        Labels with the ids of the tracks that they belong to, none of which has another label in its look; and those
+        between such a label and the track's own or another in the next look or the last, on straight lines.
     """
     return [label for category in categories for label in _of_category(looks, frozenset(believed), category)]
 
@@ -43,8 +46,10 @@ def _of_category(looks: Sequence[TrackedLook], believed: frozenset[int], categor
     tracker = BoxTracker(_REACH)
     names: dict[int, int] = {}
     found: list[Keypoints] = []
-    later: TrackedLook | None = None
-    for look, group in zip(reversed(looks), reversed(groups), strict=True):
+    ahead: dict[int, _Sighting] = {}
+    for number in reversed(range(len(looks))):
+        look, group = looks[number], groups[number]
+        later = looks[number + 1] if number + 1 < len(looks) else None
         owned = [label.track_id in believed for label in group]
         ids = tracker.update(
             np.array([label.box_xyxy for label in group], np.float64).reshape(-1, 4),
@@ -57,7 +62,23 @@ def _of_category(looks: Sequence[TrackedLook], believed: frozenset[int], categor
             if mine:
                 # Who changes hands takes the name along: no two backward tracks reach back for one.
                 names = {i: name for i, name in names.items() if name != label.track_id} | {backward: label.track_id}
+                sighting = _Sighting(number, label, reached=False)
             elif backward != UNTRACKED and backward in names and names[backward] not in taken:
-                found.append(label.renumbered(track_id=names[backward]))
-        later = look
+                sighting = _Sighting(number, label.renumbered(track_id=names[backward]), reached=True)
+                found.append(sighting.label)
+            else:
+                continue
+            after = ahead.get(sighting.label.track_id)
+            if after and after.look == number + 1 and (sighting.reached or after.reached):
+                found += interpolate_gap(sighting.label, after.label)
+            ahead[sighting.label.track_id] = sighting
     return found
+
+
+class _Sighting(NamedTuple):
+    """Of a track, in one look."""
+
+    look: int
+    label: Keypoints
+    reached: bool
+    """By going backwards; the forward association gave the track nothing here."""

@@ -23,9 +23,11 @@ class BetweenLooks:
     """The last look, and where its objects have been carried since."""
 
     flow_step: int
-    """Frames between two steps of flow; 0 for none."""
+    """Moments between two steps of flow; 0 for none."""
     shown_frames: int
     """How long something is shown that the next look, or the one before, does not know."""
+    clocks: Sequence[int]
+    """Time of each moment up to now, frames of the grid; all others here are numbered by moments."""
     seen: list[Keypoints] = field(default_factory=list)
     """What the last look saw."""
     frame: int | None = None
@@ -92,8 +94,11 @@ class BetweenLooks:
             path, end = self._paths[label.track_id], now.get(label.track_id)
             if end is None:
                 # Flow that lost it saw what now stands before it: there is nothing to show any more.
-                last = min(frame - 1, label.frame + self.shown, self._held[label.track_id])
-                labels += [step for step in along_path(path) if step.frame <= last]
+                last = min(frame - 1, self._held[label.track_id])
+                labels += [
+                    step for step in along_path(path)
+                    if step.frame <= last and self._apart(label.frame, step.frame) <= self.shown
+                ]  # fmt: skip
             elif len(path) > 1 and path[-1].frame == frame:
                 misses.append(_miss(path[-1], end))
                 labels += close_gap(path, end)
@@ -132,7 +137,7 @@ class BetweenLooks:
         paths = [[label] for label in new]
         alive = list(paths)
         for (earlier, number), (later, _) in zip(self._trail[-2:0:-1], self._trail[:1:-1], strict=True):
-            if number < frame - self.shown or not alive:
+            if self._apart(number, frame) > self.shown or not alive:
                 break
             carried = carry(later, earlier, [path[0] for path in alive], frame=number)
             for path, moved in zip(alive, carried, strict=True):
@@ -141,21 +146,41 @@ class BetweenLooks:
             alive = [path for path in alive if path[0].frame == number]
         return [label for path in paths for label in (path[0], *along_path(path)) if label.frame < frame]
 
+    def _apart(self, earlier: int, later: int) -> int:
+        """Frames of the grid from one moment to another, which may be the next that comes."""
+        known = len(self.clocks) - 1
+        return self.clocks[min(later, known)] + max(0, later - known) - self.clocks[earlier]
+
     def _inside(self, labels: list[Keypoints]) -> list[Keypoints]:
-        """Labels with their boxes cut at the picture's border; what flow took out of the picture is left out."""
+        """Without what flow took out of the picture."""
         if not self._trail:
             return labels
-        limits = np.array([*self._size, *self._size], np.float32)
-        kept = []
-        for label in labels:
-            box = np.clip(label.box_xyxy, 0, limits)
-            if _area(box) >= _LEAST_INSIDE * _area(label.box_xyxy):
-                kept.append(label if (box == label.box_xyxy).all() else replace(label, box_xyxy=box))
-        return kept
+        width, height = self._size
+        return cut_at_border(labels, width=width, height=height, least_inside=_LEAST_INSIDE)
 
 
-def _area(box_xyxy: np.ndarray) -> float:
-    return float(max(box_xyxy[2] - box_xyxy[0], 0) * max(box_xyxy[3] - box_xyxy[1], 0))
+def cut_at_border(
+    labels: Sequence[Keypoints], *, width: int, height: int, least_inside: float = 0.0
+) -> list[Keypoints]:
+    """Labels with their boxes cut at the picture's border.
+
+    Args:
+        labels: of any frames.
+        width: of the picture.
+        height: of the picture.
+        least_inside: share of a box that must lie in the picture for its label to be kept; what lies outside never is.
+    """
+    if not labels:
+        return []
+    boxes = np.stack([label.box_xyxy for label in labels])
+    cut = np.clip(boxes, 0, np.array([width, height, width, height], boxes.dtype))
+    areas, left = ((one[:, 2:] - one[:, :2]).clip(0).prod(axis=1) for one in (boxes, cut))
+    same = (cut == boxes).all(axis=1)
+    return [
+        label if same[i] else replace(label, box_xyxy=cut[i])
+        for i, label in enumerate(labels)
+        if left[i] > 0 and left[i] >= least_inside * areas[i]
+    ]
 
 
 def _at_border(box_xyxy: np.ndarray, size: tuple[int, int]) -> bool:

@@ -1,6 +1,7 @@
 """Boxes against boxes: left, top, right, bottom."""
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 
 def iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
@@ -12,6 +13,24 @@ def iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
 def inside(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
     """(N, M) share of each of the (M, 4) boxes that each of the (N, 4) covers."""
     return _shared(boxes_a, boxes_b) / np.maximum(_areas(boxes_b)[None], 1e-9)
+
+
+def best_pairs(boxes_a: np.ndarray, boxes_b: np.ndarray, *, least_iou: float) -> list[tuple[int, int, float]]:
+    """One-to-one pairs of largest summed overlap (Kuhn 1955), those that overlap too little never made.
+
+    Args:
+        boxes_a: (N, 4), left top right bottom.
+        boxes_b: (M, 4).
+        least_iou: of two boxes that may be one object.
+
+    Returns:
+        Row of ``boxes_a``, row of ``boxes_b`` and their overlap, rows of ``boxes_a`` rising.
+    """
+    overlaps = iou(boxes_a, boxes_b)
+    # A pair too far apart is worth nothing, so that it never keeps a true pair from being made.
+    worth = np.where(overlaps >= least_iou, overlaps, 0.0)
+    pairs = zip(*linear_sum_assignment(worth, maximize=True), strict=True)
+    return [(int(row), int(column), float(worth[row, column])) for row, column in pairs if worth[row, column] > 0]
 
 
 def _shared(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:

@@ -296,11 +296,6 @@ def read_tum(path: Path) -> Trajectory:
     return rebased_trajectory(rows[:, 0], rigid(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4]))
 
 
-def write_kitti(trajectory: Trajectory, path: Path) -> None:
-    """Write a row-major 3x4 camera-to-world matrix per row; KITTI's files carry no times."""
-    np.savetxt(path, trajectory.cam_to_world[:, :3].reshape(-1, 12), fmt="%.9e")
-
-
 def read_kitti(path: Path, *, fps: float) -> Trajectory:
     """A trajectory from a KITTI pose file, one row per frame at ``fps``, re-based to its first row.
 

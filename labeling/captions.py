@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -19,6 +20,8 @@ _SEEN_SHARE = 0.25
 _STILL_SPEED_M_S = 0.3
 _TURN_DEG_PER_S = 3.0
 _TURN_LEAST_DEG = 5.0
+_CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f-\x84\x86-\x9f\ud800-\udfff]")
+"""What a terminal obeys (line ends and tabs apart), and halves of characters, which UTF-8 cannot write."""
 
 
 def template_caption(labels: Sequence[Keypoints], trajectory: Trajectory | None = None) -> str:
@@ -64,8 +67,8 @@ def read_caption_table(path: Path) -> dict[str, str]:
         path: ``.csv`` (with a header), ``.parquet``, or ``.jsonl`` (one object a line).
 
     Raises:
-        DataError: the file is missing or unreadable, of another kind, lacks a column, or has an empty or repeated key
-            or an empty text.
+        DataError: the file is missing or unreadable, of another kind, lacks a column, or has an empty or repeated key,
+            an empty text, or control characters.
     """
     readers = {".csv": _csv_rows, ".parquet": _parquet_rows, ".jsonl": _jsonl_rows}
     read = readers.get(path.suffix.lower())
@@ -73,7 +76,7 @@ def read_caption_table(path: Path) -> dict[str, str]:
         raise DataError(f"{path}: captions are read from {', '.join(readers)}; convert the table to one of them")
     try:
         return _checked(path, read(path))
-    except (OSError, ValueError, csv.Error, pa.ArrowException) as error:
+    except (OSError, ValueError, RecursionError, csv.Error, pa.ArrowException) as error:
         raise DataError(
             f"{path}: cannot be read as a caption table ({error}); check the path and the format"
         ) from error
@@ -109,6 +112,8 @@ def _checked(path: Path, rows: Iterable[tuple[int, dict]]) -> dict[str, str]:
         key, text = row["key"], row["text"]
         if not isinstance(key, str) or not isinstance(text, str) or not key.strip() or not text.strip():
             raise DataError(f"{path}: row {number} has key {key!r} and text {text!r}; give two texts, neither empty")
+        if found := _CONTROL.search(key + text):
+            raise DataError(f"{path}: row {number} holds the control character {found[0]!r}; take it out")
         key = key.strip()
         if key in texts:
             raise DataError(f"{path}: row {number} repeats the key {key!r}; give each clip one text")

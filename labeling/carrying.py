@@ -45,7 +45,8 @@ class Carried:
 
     label: Keypoints
     followed: bool
-    """False: too little of it could be followed; the points are where the last motion leaves them."""
+    """False: too little of it could be followed; the points are where the motion of what could be takes them, or where
+    they were."""
 
 
 def small_grey(frame: np.ndarray) -> np.ndarray:
@@ -126,21 +127,19 @@ def along_path(path: Sequence[Keypoints]) -> list[Keypoints]:
 def interpolate_gap(start: Keypoints, end: Keypoints) -> list[Keypoints]:
     """The labels between two labels of one object, on straight lines; points that only one knows are absent."""
     gap = end.frame - start.frame
+    if gap == 1:
+        return []
     both = start.present & end.present
     shares = (np.arange(1, gap) / gap).astype(np.float32)
     first, last = (1 - shares)[:, None], shares[:, None]
     points = (first[..., None] * start.points + last[..., None] * end.points) * both[:, None]
     points[..., 2] = np.where(both, np.minimum(start.points[:, 2], end.points[:, 2]), 0)
-    boxes = first * start.box_xyxy + last * end.box_xyxy
-    scores = (1 - shares) * start.score + shares * end.score
     source = np.where(both, POINT_INTERPOLATED, POINT_ABSENT).astype(np.int8)
-    return [
-        replace(
-            start, frame=start.frame + 1 + step, points=points[step], point_source=source, box_xyxy=boxes[step],
-            score=float(scores[step]),
-        )
-        for step in range(gap - 1)
-    ]  # fmt: skip
+    return start.elsewhere(
+        range(start.frame + 1, end.frame), boxes_xyxy=first * start.box_xyxy + last * end.box_xyxy, points=points,
+        point_source=np.broadcast_to(source, points.shape[:2]),
+        scores=(1 - shares) * start.score + shares * end.score,
+    )  # fmt: skip
 
 
 def box_diagonal(box_xyxy: np.ndarray) -> float:

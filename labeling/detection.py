@@ -12,12 +12,11 @@ import cv2
 import numpy as np
 
 from labeling.boxes import inside, iou
-from labeling.model_cards import SoftSuppression, YoloxCard
+from labeling.model_cards import DETECTOR_STRIDES, SoftSuppression, YoloxCard
 from labeling.onnx_model import DEFAULT_PROVIDERS, OnnxModel, check_frame, network_input
 from labeling.schemas import Category
 
 LETTERBOX_GREY = 114
-STRIDES = (8, 16, 32)
 _MAX_CANDIDATES = 2000
 """Pairs of box and class that enter the suppression, best first: it bounds the time of the worst frame."""
 _DOUBLE_IOU = 0.45
@@ -38,7 +37,8 @@ class Detections:
     categories: np.ndarray
     """(N,) str: ``car`` or ``person``, or empty where the class is counted but not labelled."""
     left_out: int = 0
-    """How many more there were than the card's ``max_detections``."""
+    """How many more there were than the card's ``max_detections``, at least: of more than some thousands the worst are
+    not counted."""
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -227,7 +227,7 @@ def soften_overlaps(
 
 
 def _decode_boxes(raw: np.ndarray, rows: np.ndarray, card: YoloxCard) -> np.ndarray:
-    cells, strides = _grid(card.input_width, card.input_height)
+    cells, strides = grid_cells(card.input_width, card.input_height)
     centres = (raw[:, :2] + cells[rows]) * strides[rows, None]
     # exp(20) cells is beyond any picture, and finite.
     halves = np.exp(np.minimum(raw[:, 2:], 20)) * (strides[rows, None] / 2)
@@ -235,9 +235,11 @@ def _decode_boxes(raw: np.ndarray, rows: np.ndarray, card: YoloxCard) -> np.ndar
 
 
 @functools.lru_cache(maxsize=8)
-def _grid(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+def grid_cells(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Column and row (A, 2) and stride (A,) of every cell, both float32, in the order of the network's output. They are
+    shared between calls: never written to."""
     cells, strides = [], []
-    for stride in STRIDES:
+    for stride in DETECTOR_STRIDES:
         columns, rows = np.meshgrid(np.arange(width // stride), np.arange(height // stride))
         cells.append(np.stack([columns, rows], axis=2).reshape(-1, 2))
         strides.append(np.full(columns.size, stride))

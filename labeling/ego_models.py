@@ -83,20 +83,31 @@ def fit_turning(
     return rotation
 
 
+@njit(cache=True, inline="always")
+def _epipolar_lines(u, v, p, q, rotation, t):  # pragma: no cover - compiled
+    """What the Sampson distance of the match (u, v), (p, q) is made of, for the essential matrix E = [t]x R.
+
+    Returns:
+        a = R (u, v, 1); the line t x a = E (u, v, 1) in the second picture; m = (p, q, 1) x t, and the first two of
+        R^T m = E^T (p, q, 1), the line in the first picture: 11 numbers.
+    """
+    a0 = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2]
+    a1 = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2]
+    a2 = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2]
+    line0, line1, line2 = t[1] * a2 - t[2] * a1, t[2] * a0 - t[0] * a2, t[0] * a1 - t[1] * a0
+    m0, m1, m2 = q * t[2] - t[1], t[0] - p * t[2], p * t[1] - q * t[0]
+    back0 = rotation[0, 0] * m0 + rotation[1, 0] * m1 + rotation[2, 0] * m2
+    back1 = rotation[0, 1] * m0 + rotation[1, 1] * m1 + rotation[2, 1] * m2
+    return a0, a1, a2, line0, line1, line2, m0, m1, m2, back0, back1
+
+
 @njit(cache=True)
 def sampson_residuals(first: np.ndarray, second: np.ndarray, rotation: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """(n,) signed Sampson distances to the epipolar constraint (Hartley and Zisserman, eq. 11.9)."""
     out = np.empty(len(first))
-    t0, t1, t2 = direction[0], direction[1], direction[2]
     for i in range(len(first)):
         u, v, p, q = first[i, 0], first[i, 1], second[i, 0], second[i, 1]
-        a0 = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2]
-        a1 = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2]
-        a2 = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2]
-        l0, l1, l2 = t1 * a2 - t2 * a1, t2 * a0 - t0 * a2, t0 * a1 - t1 * a0
-        m0, m1, m2 = q * t2 - t1, t0 - p * t2, p * t1 - q * t0
-        k0 = rotation[0, 0] * m0 + rotation[1, 0] * m1 + rotation[2, 0] * m2
-        k1 = rotation[0, 1] * m0 + rotation[1, 1] * m1 + rotation[2, 1] * m2
+        _, _, _, l0, l1, l2, _, _, _, k0, k1 = _epipolar_lines(u, v, p, q, rotation, direction)
         out[i] = (p * l0 + q * l1 + l2) / math.sqrt(l0 * l0 + l1 * l1 + k0 * k0 + k1 * k1 + 1e-24)
     return out
 
@@ -118,13 +129,8 @@ def _sampson_system(
     t = direction
     for i in range(len(first)):
         u, v, p, q = first[i, 0], first[i, 1], second[i, 0], second[i, 1]
-        a = np.empty(3)
-        for k in range(3):
-            a[k] = rotation[k, 0] * u + rotation[k, 1] * v + rotation[k, 2]
-        line0, line1, line2 = t[1] * a[2] - t[2] * a[1], t[2] * a[0] - t[0] * a[2], t[0] * a[1] - t[1] * a[0]
-        m0, m1, m2 = q * t[2] - t[1], t[0] - p * t[2], p * t[1] - q * t[0]
-        back0 = rotation[0, 0] * m0 + rotation[1, 0] * m1 + rotation[2, 0] * m2
-        back1 = rotation[0, 1] * m0 + rotation[1, 1] * m1 + rotation[2, 1] * m2
+        a0, a1, a2, line0, line1, line2, m0, m1, m2, back0, back1 = _epipolar_lines(u, v, p, q, rotation, t)
+        a = (a0, a1, a2)
         square = line0 * line0 + line1 * line1 + back0 * back0 + back1 * back1 + 1e-24
         length = math.sqrt(square)
         value = p * line0 + q * line1 + line2

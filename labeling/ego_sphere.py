@@ -116,23 +116,6 @@ def grid_step(lens: Lens) -> int:
     return int(min(max(2, min(lens.fx, lens.fy) // _FOCAL_PER_STEP), _LARGEST_STEP))
 
 
-def sphere_coordinates(cam_to_world: np.ndarray, x: np.ndarray, y: np.ndarray, *, lens: Lens) -> np.ndarray:
-    """Exact (azimuth + 180) / 360 and polar angle / 180 where pixels look, each in [0, 1].
-
-    Args:
-        cam_to_world: (4, 4) float64, relative to the first camera.
-        x: (N,) pixel columns.
-        y: (N,) pixel rows.
-        lens: the camera's.
-
-    Returns:
-        (N, 2) float64.
-    """
-    view, one = np.array([lens.fx, lens.fy, lens.cx, lens.cy]), np.ones(2)
-    motion = np.ascontiguousarray(cam_to_world, dtype=np.float64)
-    return np.array([_texel(a, b, motion, view, one) for a, b in zip(x, y, strict=True)]).reshape(-1, 2) + 0.5
-
-
 @njit(cache=True, error_model="numpy", inline="always")
 def _texel(x, y, motion, view, size):  # pragma: no cover - compiled
     """Where pixel (x, y) meets the sphere, in texels whose centres lie on integers."""

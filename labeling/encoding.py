@@ -103,11 +103,6 @@ class VideoWriter:
         if self._settings.codec == "libx264":
             tag_bt709(context)
 
-    @property
-    def frames_written(self) -> int:
-        """How many frames have been handed over so far."""
-        return self._index
-
     def write(self, rgb: np.ndarray) -> None:
         """Append a (H, W, 3) uint8 RGB picture."""
         width, height = self._size

@@ -4,6 +4,7 @@ Keypoints are the truth; skeleton, object and caption are views of them.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -42,26 +43,47 @@ class Keypoints:
     """(K,) int8: 0 absent, 1 detected, 2 carried by flow, 3 interpolated."""
 
     def __post_init__(self) -> None:
-        count = keypoint_schema(self.schema).point_count
-        if self.box_xyxy.shape != (4,) or self.points.shape != (count, 3) or self.point_source.shape != (count,):
-            raise DataError(
-                f"{self.schema} needs box_xyxy (4,), points ({count}, 3) and point_source ({count},), got "
-                f"{self.box_xyxy.shape}, {self.points.shape}, {self.point_source.shape}; check the extractor's schema"
-            )
-        # A sum is finite only where all that went into it is: one check instead of three, for every label made.
-        if not math.isfinite(float(self.points.sum(dtype=np.float64)) + float(self.box_xyxy.sum()) + self.score):
-            raise DataError(f"frame {self.frame}: a {self.category} has coordinates or scores that are not finite")
+        shapes = self.box_xyxy.shape, self.points.shape, self.point_source.shape
+        _check(self, shapes, float(self.points.sum(dtype=np.float64)) + float(self.box_xyxy.sum()) + self.score)
 
     def renumbered(self, *, frame: int | None = None, track_id: int | None = None) -> "Keypoints":
         """The same sighting under another frame or track. What was checked once is not checked again: a run's labels
         are renumbered several times each."""
+        return self._twin(
+            frame=self.frame if frame is None else frame, track_id=self.track_id if track_id is None else track_id
+        )
+
+    def elsewhere(
+        self, frames: Sequence[int], *, boxes_xyxy: np.ndarray, points: np.ndarray, point_source: np.ndarray,
+        scores: np.ndarray,
+    ) -> "list[Keypoints]":  # fmt: skip
+        """The same object in T other frames; all are checked at once, which is what most of making a label costs.
+
+        Args:
+            frames: T numbers.
+            boxes_xyxy: (T, 4) float32.
+            points: (T, K, 3) float32.
+            point_source: (T, K) int8.
+            scores: (T,).
+
+        Raises:
+            DataError: as for one.
+        """
+        shapes = boxes_xyxy.shape[1:], points.shape[1:], point_source.shape[1:]
+        _check(self, shapes, float(points.sum(dtype=np.float64)) + float(boxes_xyxy.sum()) + float(scores.sum()))
+        return [
+            self._twin(
+                frame=frame, box_xyxy=boxes_xyxy[n], points=points[n], point_source=point_source[n],
+                score=float(scores[n]),
+            )
+            for n, frame in enumerate(frames)
+        ]  # fmt: skip
+
+    def _twin(self, **changes: object) -> "Keypoints":
+        """``dataclasses.replace`` without a check."""
         twin = object.__new__(Keypoints)
         for name in _FIELDS:
-            object.__setattr__(twin, name, getattr(self, name))
-        if frame is not None:
-            object.__setattr__(twin, "frame", frame)
-        if track_id is not None:
-            object.__setattr__(twin, "track_id", track_id)
+            object.__setattr__(twin, name, changes[name] if name in changes else getattr(self, name))
         return twin
 
     @property
@@ -71,3 +93,16 @@ class Keypoints:
 
 
 _FIELDS = tuple(field.name for field in fields(Keypoints))
+
+
+def _check(label: Keypoints, shapes: tuple[tuple[int, ...], ...], total: float) -> None:
+    """Of box, points and sources: their shapes, and the sum of all numbers, which is finite only where each of them is:
+    one check instead of three, for every label made."""
+    count = keypoint_schema(label.schema).point_count
+    if shapes != ((4,), (count, 3), (count,)):
+        raise DataError(
+            f"{label.schema} needs box_xyxy (4,), points ({count}, 3) and point_source ({count},), got "
+            f"{shapes[0]}, {shapes[1]}, {shapes[2]}; check the extractor's schema"
+        )
+    if not math.isfinite(total):
+        raise DataError(f"frame {label.frame}: a {label.category} has coordinates or scores that are not finite")

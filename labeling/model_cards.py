@@ -20,6 +20,8 @@ from labeling.schemas import Category, KeypointSchema, keypoint_schema
 SHIPPED_CARDS = Path(__file__).with_name("models")
 """The folder of the cards that ship, and of the street models' weights."""
 
+DETECTOR_STRIDES = (8, 16, 32)
+"""Pixels between the cells of a YOLOX's levels, in the order of its output."""
 IMAGENET_MEAN = (123.675, 116.28, 103.53)
 IMAGENET_STD = (58.395, 57.12, 57.375)
 """Per channel (R, G, B), in units of 0 to 255."""
@@ -41,11 +43,16 @@ Dimensions = tuple[int | None, ...]
 """A tensor's shape as a card states it; ``None`` (the batch) may be anything."""
 
 
+MAX_INPUT_SIDE = 4096
+"""Pixels: several times what any extractor takes, and an input that memory has room for."""
+_LEAST_STD, _GREATEST_LEVEL = 1e-3, 1e6
+"""What mean and std are bounded by, in units of 0 to 255: beyond it, no input keeps a picture's differences."""
+
 DEFAULT_SURE_SCORE = 0.5
 """At which a detected object may begin a track (Zhang et al. 2022, ByteTrack)."""
 
 
-class ModelCard(BaseModel, frozen=True, extra="forbid", populate_by_name=True):
+class ModelCard(BaseModel, frozen=True, extra="forbid", populate_by_name=True, allow_inf_nan=False):
     """What every extractor's card states. The subclasses add what their kind needs."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
@@ -54,8 +61,8 @@ class ModelCard(BaseModel, frozen=True, extra="forbid", populate_by_name=True):
     """File name of the weights, without a folder."""
     sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$")
     """Of the ONNX file; absent where users export their own file, whose bytes nobody can know beforehand."""
-    input_width: int = Field(gt=0)
-    input_height: int = Field(gt=0)
+    input_width: int = Field(gt=0, le=MAX_INPUT_SIDE)
+    input_height: int = Field(gt=0, le=MAX_INPUT_SIDE)
     channel_order: Literal["rgb", "bgr"]
     mean: tuple[float, float, float]
     """Subtracted per channel, in the channel order, units of 0 to 255."""
@@ -70,9 +77,16 @@ class ModelCard(BaseModel, frozen=True, extra="forbid", populate_by_name=True):
 
     @field_validator("std")
     @classmethod
-    def _std_is_positive(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        if min(value) <= 0:
-            raise ValueError(f"std must be positive, got {value}")
+    def _std_divides(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not _LEAST_STD <= min(value) <= max(value) <= _GREATEST_LEVEL:
+            raise ValueError(f"std must be {_LEAST_STD:g} to {_GREATEST_LEVEL:g}, got {value}")
+        return value
+
+    @field_validator("mean")
+    @classmethod
+    def _mean_is_a_level(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if max(map(abs, value)) > _GREATEST_LEVEL:
+            raise ValueError(f"mean must be at most {_GREATEST_LEVEL:g} from 0, got {value}")
         return value
 
     def output_shapes(self) -> dict[str, Dimensions]:
@@ -80,7 +94,7 @@ class ModelCard(BaseModel, frozen=True, extra="forbid", populate_by_name=True):
         raise NotImplementedError
 
 
-class SoftSuppression(BaseModel, frozen=True, extra="forbid"):
+class SoftSuppression(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """How much of its score a box keeps that overlaps a better one of its class: the lesser of two shares."""
 
     sigma: float = Field(gt=0)
@@ -154,7 +168,7 @@ class YoloxCard(ModelCard, frozen=True):
 
     def output_shapes(self) -> dict[str, Dimensions]:
         """One output: a row of box, objectness and class scores per grid cell."""
-        cells = sum((self.input_width // stride) * (self.input_height // stride) for stride in (8, 16, 32))
+        cells = sum((self.input_width // stride) * (self.input_height // stride) for stride in DETECTOR_STRIDES)
         return {"output": (None, cells, 5 + len(self.class_names))}
 
 
@@ -166,9 +180,9 @@ class SimccCard(ModelCard, frozen=True):
     channel_order: Literal["rgb", "bgr"] = "rgb"
     mean: tuple[float, float, float] = IMAGENET_MEAN
     std: tuple[float, float, float] = IMAGENET_STD
-    crop_padding: float = Field(default=1.25, ge=1)
+    crop_padding: float = Field(default=1.25, ge=1, le=100)
     """The crop's size relative to the box, before it is widened to the model's aspect."""
-    simcc_split: float = Field(default=2.0, gt=0)
+    simcc_split: float = Field(default=2.0, gt=0, le=100)
     """Response bins per input pixel."""
 
     @property
@@ -195,7 +209,7 @@ class SimccCard(ModelCard, frozen=True):
         }
 
 
-class FieldHeadCard(BaseModel, frozen=True, extra="forbid", populate_by_name=True):
+class FieldHeadCard(BaseModel, frozen=True, extra="forbid", populate_by_name=True, allow_inf_nan=False):
     """One pair of CIF and CAF outputs, and how it is decoded (OpenPifPaf's constants by default)."""
 
     schema_name: str = Field(alias="schema")
@@ -248,6 +262,9 @@ class CifcafCard(ModelCard, frozen=True):
         names = [name for head in self.heads for name in (head.cif, head.caf)]
         if len(set(names)) != len(names):
             raise ValueError(f"two heads read the same output: {names}")
+        categories = [keypoint_schema(head.schema_name).category for head in self.heads]
+        if len(set(categories)) != len(categories):
+            raise ValueError(f"two heads give the same category: {categories}; leave one of them out")
         return self
 
     def output_shapes(self) -> dict[str, Dimensions]:
@@ -277,7 +294,7 @@ def read_card(path: Path) -> YoloxCard | SimccCard | CifcafCard:
     except ValidationError as error:
         faults = "; ".join(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors())
         raise ModelError(f"model card {path}: {faults}; compare it with {SHIPPED_CARDS}/*.toml") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # tomllib raises each, for the length and depth of values
         raise ModelError(f"model card {path} cannot be read as TOML: {error}; mend or remove it") from error
 
 

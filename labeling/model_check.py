@@ -24,9 +24,10 @@ from labeling.model_cards import (
     SimccCard,
     YoloxCard,
 )
-from labeling.onnx_model import DEFAULT_PROVIDERS, OnnxModel, check_frame
+from labeling.onnx_model import DEFAULT_PROVIDERS, OnnxModel, check_frame, network_input
 
-Verdict = Literal["fits", "another fits better", "unclear"]
+Verdict = Literal["fits", "another fits better", "unclear", "fails"]
+"""``fails``: fed as its card says, it gives nothing that can be used."""
 
 _RANGES = {
     "0 to 255": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
@@ -56,6 +57,8 @@ class VariantResult:
     """Its confidences lay outside 0 to 1, and were put through a sigmoid."""
     note: str = ""
     """Why it could not be run."""
+    failed: bool = False
+    """The network is at fault for that, not the pictures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,10 +106,14 @@ def check_card(
     scenes = list(zip(pictures, boxes_xyxy, strict=True))
     variants = [_try(model, variant, name, scenes, is_card=variant == card) for name, variant in _variants(card)]
     variants.sort(key=lambda result: (-result.evidence, not result.is_card, result.name))
-    verdict, advice = _judge(variants, seen=bool(images))
+    verdict, advice = _judge(variants, seen=bool(images), batch_fault=_batch_fault(model))
     return CardCheck(
         card=card.name, providers=model.providers, variants=tuple(variants), verdict=verdict, advice=advice
     )
+
+
+class _NothingToSeeError(ModelError):
+    """A head was given no box to look at."""
 
 
 Scene = tuple[np.ndarray, np.ndarray]
@@ -130,7 +137,8 @@ def _try(model: OnnxModel, variant: ModelCard, name: str, scenes: Sequence[Scene
     try:
         looks = [look(model, variant, picture, boxes) for picture, boxes in scenes]
     except ModelError as error:
-        return VariantResult(name=name, is_card=is_card, objects=0, evidence=0.0, note=str(error))
+        failed = not isinstance(error, _NothingToSeeError)
+        return VariantResult(name=name, is_card=is_card, objects=0, evidence=0.0, note=str(error), failed=failed)
     logits = any(added for _, added in looks)
     return VariantResult(
         name=name + (", sigmoid added" if logits else ""), is_card=is_card and not logits, logits=logits,
@@ -151,7 +159,7 @@ def _look_simcc(model: OnnxModel, card: ModelCard, picture: np.ndarray, boxes: n
     assert isinstance(card, SimccCard)
     crops = [crop for box in boxes if (crop := plan_crop(box, card)) is not None]
     if not crops:
-        raise ModelError(f"none of the {len(boxes)} boxes has an area; give left, top, right, bottom in pixels")
+        raise _NothingToSeeError(f"none of the {len(boxes)} boxes has an area; give left, top, right, bottom in pixels")
     simcc_x, simcc_y = model.run(np.stack([crop_input(picture, crop, card) for crop in crops]))
     scores = decode_simcc(simcc_x, simcc_y, split=card.simcc_split)[..., 2]
     return np.minimum(scores[scores > 0], 1), False
@@ -178,8 +186,22 @@ def _as_confidence(values: np.ndarray) -> tuple[np.ndarray, bool]:
     return 1 / (1 + np.exp(-np.clip(values, -60, 60))), True
 
 
-def _judge(variants: Sequence[VariantResult], *, seen: bool) -> tuple[Verdict, str]:
-    best = variants[0]
+def _batch_fault(model: OnnxModel) -> str:
+    """Why the network does not take two pictures at once; empty where it does."""
+    planes = network_input(_noise(model.card), model.card)
+    try:
+        model.run(np.stack([planes, planes[:, ::-1]]))
+    except ModelError as error:
+        return str(error)
+    return ""
+
+
+def _judge(variants: Sequence[VariantResult], *, seen: bool, batch_fault: str) -> tuple[Verdict, str]:
+    best, own = variants[0], next((result for result in variants if result.is_card), None)
+    if own is not None and own.failed:
+        return "fails", f"fed as its card says ({own.name}), {own.note}"
+    if batch_fault:
+        return "fails", f"given two pictures at once, {batch_fault}"
     if any(result.logits for result in variants):
         return "another fits better", (
             f"its confidences lie outside 0 to 1: they are logits, best fed as {best.name}; "
@@ -189,7 +211,7 @@ def _judge(variants: Sequence[VariantResult], *, seen: bool) -> tuple[Verdict, s
         return "unclear", "file, hash, shapes and ranges hold; give pictures that show cars or people for the rest"
     if best.evidence <= 0:
         return "unclear", "nothing is seen in any way: give pictures that show what the network looks for"
-    own = next(result for result in variants if result.is_card)
+    assert own is not None, "only logits take the card's own way from it"
     rivals = [result for result in variants if not result.is_card]
     if rivals[0].evidence < _CLEAR_SHARE * own.evidence:
         return "fits", f"{own.name}, as the card says"

@@ -14,6 +14,9 @@ from labeling.model_cards import ModelCard, file_sha256
 MAX_EXTERNAL_BYTES = 8 << 30
 """No extractor's weights come near it."""
 
+_NO_FILE_NAME = (OSError, ValueError, RuntimeError)
+"""What ``pathlib`` raises of a name that is too long, holds a NUL, or links in a circle."""
+
 
 def check_file(card: ModelCard, path: Path) -> None:
     """That ``path`` is the ONNX file that ``card`` means, and reads nothing outside its folder.
@@ -69,8 +72,17 @@ def _checked_external_files(path: Path, size: int, modified_ns: int) -> tuple[Pa
     tensors = (tensor for tensor in _tensors(model) if tensor.data_location == onnx.TensorProto.EXTERNAL)
     names = {entry.value for tensor in tensors for entry in tensor.external_data if entry.key == "location"}
     folder = path.resolve().parent
-    files = ((folder / name).resolve() for name in sorted(names))
-    return tuple(file for file in files if file.is_relative_to(folder) and file.is_file())
+    files = (_file_beside(folder, name) for name in sorted(names))
+    return tuple(file for file in files if file is not None and file.is_relative_to(folder))
+
+
+def _file_beside(folder: Path, name: str) -> Path | None:
+    """The file of that name; None where there is none, or none can have such a name."""
+    try:
+        file = (folder / name).resolve()
+        return file if file.is_file() else None
+    except _NO_FILE_NAME:
+        return None
 
 
 def check_external_data(path: Path) -> None:
@@ -98,13 +110,20 @@ def check_external_data(path: Path) -> None:
 def _check_external_tensor(tensor: onnx.TensorProto, folder: Path, path: Path) -> int:
     entries = {entry.key: entry.value for entry in tensor.external_data}
     location = entries.get("location", "")
-    target = (folder / location).resolve()
+    try:
+        target = (folder / location).resolve()
+        there = target.is_file()
+    except _NO_FILE_NAME as error:
+        raise ModelError(
+            f"{path}: tensor {tensor.name!r} is stored in {location[:60]!r}, which names no file "
+            f"({first_line(error)}); export the model again"
+        ) from error
     if not location or Path(location).is_absolute() or not target.is_relative_to(folder) or target == folder:
         raise ModelError(
             f"{path}: tensor {tensor.name!r} is stored in {location!r}, outside the model's folder; refused: "
             "keep external data beside the ONNX file"
         )
-    if not target.is_file():
+    if not there:
         raise ModelError(f"{path}: tensor {tensor.name!r} is stored in {location!r}, which is not there; copy it too")
     try:
         offset, size = int(entries.get("offset", 0)), target.stat().st_size

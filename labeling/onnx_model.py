@@ -65,6 +65,7 @@ class OnnxModel:
         whole = self._open()
         self.providers: tuple[str, ...] = tuple(whole.get_providers())
         self._graph = _check_graph(whole, card, path)
+        self._shapes = dict(zip(self._graph.output_names, card.output_shapes().values(), strict=True))
         self._sessions = {self._graph.output_names: whole}
         """By the outputs that each computes."""
 
@@ -82,7 +83,8 @@ class OnnxModel:
             outputs: which of them, by place; all by default. What only the others need is not computed.
 
         Raises:
-            ModelError: the shape is not the card's, the network fails, or its output is not finite.
+            ModelError: the shape is not the card's, the network fails, or its output is not finite or not of the
+                shape that it states, one row for each input.
         """
         wanted = (3, self.card.input_height, self.card.input_width)
         if batch.ndim != 4 or batch.shape[1:] != wanted or batch.dtype != np.float32:
@@ -120,6 +122,12 @@ class OnnxModel:
             ) from error
         outputs = [np.asarray(result) for result in results]
         for name, output in zip(names, outputs, strict=True):
+            wanted = (len(chunk), *self._shapes[name][1:])
+            if output.shape != wanted:
+                raise ModelError(
+                    f"{self.card.name} gave {_show(output.shape)} in {name!r} for a batch of {len(chunk)}, not "
+                    f"{_show(wanted)}; export {self.path} with the shapes that it states, or with a fixed batch of 1"
+                )
             if not np.isfinite(output).all():
                 raise ModelError(
                     f"{self.card.name} gave NaN or infinity in {name!r}; check the file {self.path} and its precision "

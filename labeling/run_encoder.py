@@ -11,6 +11,7 @@ from labeling.conversion import FrameConverter, luma
 from labeling.encoding import VideoWriter
 from labeling.errors import VideoError
 from labeling.hard_cuts import find_hard_cuts, thumbnail
+from labeling.moments import same_picture
 from labeling.video import SAME_TIME_S, SourceFrame
 
 
@@ -23,11 +24,16 @@ class RunEncoder:
         self._writer = writer
         self._next = 0
         self._shown: av.VideoFrame | None = None
+        self._grey: np.ndarray | None = None
+        self._is_new = True
         self._thumbnails: list[np.ndarray] = []
         self._thumbnail_of = np.zeros(len(wanted_s), dtype=np.int64)
         self._bidirectional: list[int] = []
         self.lost = np.zeros(len(wanted_s), dtype=bool)
         """(N,) bool, frames whose source frame did not decode, or came out damaged."""
+        self.repeated = np.zeros(len(wanted_s), dtype=bool)
+        """(N,) bool, frames that show the picture of the one before: a source frame twice, or one of a camera that
+        froze. Once coded again they differ."""
 
     def show(self, frame: SourceFrame) -> None:
         """Take the next frame out of ``converted_frames``; it is encoded if the run wants it."""
@@ -79,13 +85,15 @@ class RunEncoder:
             self._bidirectional.extend(range(first, end))
 
     def _take(self, picture: av.VideoFrame) -> None:
-        self._shown = picture
         grey = luma(picture) if picture.format.name == "yuv420p" else _grey(picture)
+        self._is_new = self._grey is None or not same_picture(self._grey, grey)
+        self._shown, self._grey = picture, grey
         self._thumbnails.append(thumbnail(grey))
 
     def _repeat(self, times: int) -> None:
         assert self._shown is not None
         for _ in range(times):
+            self.repeated[self._next], self._is_new = not self._is_new, False
             self._writer.write_frame(self._shown)
             self._thumbnail_of[self._next] = len(self._thumbnails) - 1
             self._next += 1

@@ -115,14 +115,11 @@ def _smooth_track(group: list[Keypoints], settings: SmoothingSettings) -> list[K
     source[filled] = POINT_INTERPOLATED
     points[..., :2] = smooth_series(points, settings)
     boxes = smooth_series(corners, settings).reshape(length, 4).astype(np.float32)
-    points = points.astype(np.float32)
-    return [
-        replace(
-            group[0], frame=first + row, score=float(scores[row]), box_xyxy=boxes[row], points=points[row],
-            point_source=source[row],
-        )
-        for row in np.flatnonzero(corners[:, 0, 2] > 0).tolist()
-    ]  # fmt: skip
+    shown = np.flatnonzero(corners[:, 0, 2] > 0)
+    return group[0].elsewhere(
+        (first + shown).tolist(), boxes_xyxy=boxes[shown], points=points.astype(np.float32)[shown],
+        point_source=source[shown], scores=scores[shown],
+    )  # fmt: skip
 
 
 def fill_holes(points: np.ndarray, fill_frames: int) -> tuple[np.ndarray, np.ndarray]:
@@ -170,7 +167,7 @@ def smooth_series(points: np.ndarray, settings: SmoothingSettings) -> np.ndarray
     residual = np.linalg.norm(positions - narrow, axis=-1)
     gap = np.linalg.norm(wide - narrow, axis=-1)
     # One window for the whole object, since its points move together; the noise is each object's own.
-    sigma = np.median(residual[present]) if present.any() else 0.0
+    sigma = masked_median(residual.reshape(1, -1), present.reshape(1, -1))[0]
     object_gap = masked_median(gap, present)
     share = np.clip(2 - object_gap / max(settings.agreement * sigma, 1e-6), 0, 1)[:, None, None]
     # A point that bends while its object does not (a foot of someone who stands) keeps the narrow fit.

@@ -54,9 +54,8 @@ class Span:
 class Timeline:
     """A source video on a grid of constant rate."""
 
-    t0_s: float
-    """The source's first presentation time; grid frame i is at ``t0_s + i / fps``."""
     fps: int
+    """Grid frame i is at i / fps after the source's first presentation time."""
     source_time_s: np.ndarray
     """(N,) float64, presentation time of the source frame that each grid frame shows."""
     duplicate: np.ndarray
@@ -107,7 +106,7 @@ class RunFrames:
     source_time_s: np.ndarray
     """(N,) float64."""
     duplicate: np.ndarray
-    """(N,) bool, as in ``Timeline``."""
+    """(N,) bool, shows the picture of the frame before: the same source frame, or the next of a camera that froze."""
     hole: np.ndarray
     """(N,) bool, in a gap of the source, or its source frame did not decode: it shows a neighbour instead."""
     cut: np.ndarray
@@ -140,7 +139,6 @@ def plan_timeline(packet_times_s: np.ndarray, *, fps: int = FPS) -> Timeline:
     inside = (times[before] < grid - _TIE_S) & (grid + _TIE_S < times[after])
     source = times[chosen]
     return Timeline(
-        t0_s=t0,
         fps=fps,
         source_time_s=source,
         duplicate=np.concatenate([[False], source[1:] == source[:-1]]),
@@ -300,7 +298,7 @@ def cut_run(
     return RunFrames(
         frame=np.arange(span.start, span.end, dtype=np.int32),
         source_time_s=wanted.copy(),
-        duplicate=timeline.duplicate[span.start : span.end].copy(),
+        duplicate=run.repeated,
         hole=timeline.hole[span.start : span.end] | run.lost,
         cut=run.cuts(),
     )

@@ -98,13 +98,19 @@ def believed_tracks(
     """
     sure_scores = sure_scores or {}
     seen: Counter[int] = Counter()
-    run: Counter[int] = Counter()
     longest: Counter[int] = Counter()
-    for label in (label for look in looks for label in look.labels if label.track_id != UNTRACKED):
-        track_id = label.track_id
-        seen[track_id] += 1
-        run[track_id] = run[track_id] + 1 if label.score >= sure_scores.get(label.category, 0.0) else 0
-        longest[track_id] = max(longest[track_id], run[track_id])
+    run: dict[int, int] = {}
+    for look in looks:
+        tracked = [label for label in look.labels if label.track_id != UNTRACKED]
+        seen.update(label.track_id for label in tracked)
+        # Who is not in this look begins anew.
+        run = {
+            label.track_id: run.get(label.track_id, 0) + 1
+            if label.score >= sure_scores.get(label.category, 0.0) else 0
+            for label in tracked
+        }  # fmt: skip
+        for track_id, length in run.items():
+            longest[track_id] = max(longest[track_id], length)
     return frozenset(i for i, count in seen.items() if count >= min_looks and longest[i] >= sure_looks)
 
 
@@ -131,22 +137,26 @@ def trim_doubt(labels: Iterable[Keypoints], *, least_scores: Mapping[str, float]
 
 
 def drop_brief_tracks(
-    labels: Sequence[Keypoints], *, min_frames: int, open_at: Collection[int] = ()
+    labels: Sequence[Keypoints], clocks: Sequence[int], *, min_frames: int, pace: int = 1, open_at: Collection[int] = ()
 ) -> list[Keypoints]:
-    """Without tracks that last less than ``min_frames`` from their first frame to their last.
+    """Without tracks that last less than ``min_frames`` from their first moment to the end of their last.
 
     Args:
-        labels: tracked.
-        min_frames: least length.
-        open_at: the frames at which a run begins and ends: who is there has been, or will be, for longer than it shows.
+        labels: tracked, by moment.
+        clocks: time of each moment, frames of the grid.
+        min_frames: least length, frames of the grid.
+        pace: for how many of them a moment lasts.
+        open_at: the moments at which a run begins and ends: who is there has been, or will be, for longer than it
+            shows.
     """
     open_at = frozenset(open_at)
-    frames: dict[int, list[int]] = {}
+    moments: dict[int, list[int]] = {}
     for label in labels:
-        frames.setdefault(label.track_id, []).append(label.frame)
+        moments.setdefault(label.track_id, []).append(label.frame)
     lasting = {
-        i for i, shown in frames.items() if max(shown) - min(shown) + 1 >= min_frames or not open_at.isdisjoint(shown)
-    }
+        i for i, shown in moments.items()
+        if clocks[max(shown)] - clocks[min(shown)] + pace >= min_frames or not open_at.isdisjoint(shown)
+    }  # fmt: skip
     return [label for label in labels if label.track_id in lasting]
 
 

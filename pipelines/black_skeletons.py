@@ -6,6 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
+from dataset.layout import JOB_FILE
 from labeling.errors import AnimaticError
 from pipelines.job import Job, open_job
 from pipelines.stages_select import job_extractors
@@ -25,5 +26,5 @@ def black_skeletons(job: Job) -> str:
 
 def print_black_skeletons(root: Path, console: Console) -> None:
     """A line, where a folder is a job's and its skeletons show nothing."""
-    if (root / "job.yaml").is_file() and (note := black_skeletons(open_job(root))):
+    if (root / JOB_FILE).is_file() and (note := black_skeletons(open_job(root))):
         console.print(f"[yellow]note[/] {escape(note)}")

@@ -40,11 +40,16 @@ _NAMED_DIGITS = "125"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cost:
-    """Milliseconds per frame over interleaved runs."""
+    """Milliseconds per frame."""
 
     median: float
+    """The middle; over clips the mean of all their frames, since their methods differ in what each clip costs."""
     p95: float
+    """The upper end; over clips the dearest."""
     runs: int
+    """How many measurements."""
+    over: Literal["runs", "clips", "videos", "frames"] = "runs"
+    """What was measured so often."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +74,8 @@ class ChartPoint:
     """By other metrics, the same ones for every point of a chart; each is drawn below the first."""
     reference: bool = False
     """The best that can be run at all, or the trivial method: drawn apart."""
+    group: str = ""
+    """Only points of one group vie with each other: each has a front of its own."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +107,7 @@ def machine_name() -> str:
 def interleaved_ms(methods: Sequence[Callable[[], int]], *, runs: int) -> list[Cost]:
     """Cost of each method; a method runs once and returns how many frames it did.
 
-    The methods take turns, ``runs`` times, and processor time of this thread is counted, so that what else runs on the
+    The methods take turns, ``runs`` times, and processor time of this process is counted, so that what else runs on the
     machine weighs on all of them alike, and little.
     """
     samples: list[list[float]] = [[] for _ in methods]
@@ -175,7 +182,7 @@ def draw_chart(chart: Chart, path: Path) -> None:
     )  # fmt: skip
     floor = f"; below {least:.2g} drawn at {least:.2g}" if least else ""
     left_out = "".join(f"\nleft out: {line}" for line in chart.left_out)
-    every_axes[-1].set_xlabel(f"cost, {cost_label(chart)} (median, log{floor}){left_out}")
+    every_axes[-1].set_xlabel(f"cost, {cost_label(chart)} (log{floor}){left_out}")
     figure.draw_without_rendering()
     for axes, points in zip(every_axes, panels, strict=True):
         _name_points(axes, points)
@@ -195,13 +202,15 @@ def _as_drawn(point: ChartPoint, error: Error, least_ms: float) -> ChartPoint:
 
 
 def _draw_panel(axes: Any, points: Sequence[ChartPoint]) -> None:
-    front = pareto_front(points)
-    axes.step(
-        [point.ms_per_frame.median for point in front], [point.error.median for point in front], where="post",
-        color="#2b6cb0", alpha=0.5, linewidth=1.5, zorder=1,
-    )  # fmt: skip
+    groups = dict.fromkeys(point.group for point in points)
+    fronts = [pareto_front([point for point in points if point.group == group]) for group in groups]
+    for front in fronts:
+        axes.step(
+            [point.ms_per_frame.median for point in front], [point.error.median for point in front], where="post",
+            color="#2b6cb0", alpha=0.5, linewidth=1.5, zorder=1,
+        )  # fmt: skip
     for point in points:
-        colour = "#c05621" if point.reference else "#2b6cb0" if point in front else "#718096"
+        colour = "#c05621" if point.reference else "#2b6cb0" if any(point in front for front in fronts) else "#718096"
         axes.scatter(
             point.ms_per_frame.median, point.error.median, s=46, color=colour, zorder=3,
             marker="D" if point.reference else "o",
@@ -218,7 +227,7 @@ def _draw_panel(axes: Any, points: Sequence[ChartPoint]) -> None:
             axis.set_minor_formatter(_named_tick)
             axis.set_tick_params(which="both", length=4, pad=4)
     axes.margins(x=0.18, y=0.12)
-    axes.set_ylabel(f"{points[0].error.metric}, {points[0].error.unit} (median)")
+    axes.set_ylabel(f"{points[0].error.metric}, {points[0].error.unit}")
     axes.grid(True, which="both", alpha=0.2)
     axes.spines[["top", "right"]].set_visible(False)
 

@@ -66,6 +66,7 @@ def chart(name: str, *, quick: bool = False) -> Chart:
                 median=float(np.median(seconds[method])),
                 p95=float(np.percentile(seconds[method], 95)),
                 runs=len(videos),
+                over="videos",
             ),
             error=_error(counts[method], truth),
             reference=method in (_REFERENCE, _TRIVIAL),

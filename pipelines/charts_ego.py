@@ -127,7 +127,7 @@ _METHODS: dict[str, tuple[Method, Callable[[EgoClip], EgoClip]]] = {
     "phase correlation": (methods.phase_correlation, _same),
     "rotation only": (methods.rotation_only, _same),
     "stock findEssentialMat + recoverPose": (methods.stock_opencv, _same),
-    "the same, distance limit lifted": (partial(methods.stock_opencv, distance_limit=1e9), _same),
+    "stock, no distance limit": (partial(methods.stock_opencv, distance_limit=1e9), _same),
     "MAGSAC": (partial(methods.stock_opencv, method=cv2.USAC_MAGSAC, distance_limit=1e9), _same),
     "IRLS alone": (methods.irls_alone, _same),
     "ladder at 1/3": (partial(methods.ladder, long_side=414), _same),

@@ -58,7 +58,6 @@ class _Result:
     shown: int
     figures: dict[str, Any]
     cpu_ms: float
-    wall_ms: float
 
 
 def chart(name: str, *, quick: bool = False) -> Chart:
@@ -180,7 +179,7 @@ def _measure(label: Method, clip: KeypointClip) -> _Result:
     if any(label.track_id != UNTRACKED for label in found):
         tracks = track_score(found, clip.truth)
         figures |= {"switches": tracks.switches, "idf1": tracks.idf1, "mota": tracks.mota}
-    return _Result(right=score.right, shown=score.shown, figures=figures, cpu_ms=cpu_ms, wall_ms=wall_ms)
+    return _Result(right=score.right, shown=score.shown, figures=figures, cpu_ms=cpu_ms)
 
 
 def _point(method: str, results: Sequence[_Result], clips: Sequence[KeypointClip]) -> ChartPoint:
@@ -195,7 +194,8 @@ def _point(method: str, results: Sequence[_Result], clips: Sequence[KeypointClip
     return ChartPoint(
         method=method, settings=figures, reference=method in ("first look kept", "exact"),
         ms_per_frame=Cost(
-            median=float(np.average(spent, weights=sizes)), p95=float(np.max(spent)), runs=len(clips)
+            median=float(np.average(spent, weights=sizes)), p95=float(np.max(spent)), runs=len(clips),
+            over="clips",
         ),
         error=Error(
             metric="visible points not within 0.1 of the box diagonal", unit="%", median=_wrong(results),

@@ -42,8 +42,6 @@ _STARTS: dict[Scenario, int] = {"stop_and_go": 24}
 """Frames to skip: everybody brakes from the second second on."""
 _SEED = HELD_OUT_SEED + 200
 _GREEDY_IOU = 0.3
-_LEAST_MS = 0.01
-"""The axis is logarithmic: what costs nothing is drawn there."""
 _LEG_POINTS = (13, 14, 15, 16)
 """Knees and ankles of ``coco17``."""
 
@@ -99,7 +97,7 @@ def chart(name: str, *, quick: bool = False) -> Chart:
             start = time.process_time()
             found[method] = [track(clip) for clip in clips]
             taken = time.process_time() - start
-            spent[method].append(max(_LEAST_MS, taken * 1000 / sum(len(clip.clip) for clip in clips)))
+            spent[method].append(taken * 1000 / sum(len(clip.clip) for clip in clips))
     points = tuple(_point(method, found[method], clips, spent[method]) for method in METHODS)
     data = f"the same looks at {WIDTH}x{HEIGHT}: {pooled_names([clip.clip for clip in clips])}"
     return Chart(stage=name, data=data, points=points, machine=machine_name())

@@ -192,6 +192,7 @@ def _point(method: _Method, measures: Sequence[StepMeasure]) -> ChartPoint:
     gib = [measure.peak_gib for measure in measures]
     return ChartPoint(
         method=method.name, settings=method.settings(), reference=method.reference,
+        group=f"{method.width}x{method.height}",
         ms_per_frame=Cost(median=float(np.median(ms)), p95=float(np.percentile(ms, 95)), runs=len(ms)),
         error=Error(
             metric="peak memory", unit="GiB", median=float(np.median(gib)), p95=float(np.percentile(gib, 95))

@@ -179,7 +179,7 @@ def stability(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the table.")] = Path("charts"),
     quick: Annotated[bool, typer.Option("--quick", help="Fewer runs on less data.")] = False,
 ) -> None:
-    """Where methods fail: named scenarios, a bound each, held or not."""
+    """Where methods fail: named scenarios, a bound each, held or not; exit code 1 where ours holds one not."""
     from pipelines.measure import show_stability
 
     raise typer.Exit(show_stability(stage, out=out, quick=quick))

@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.markup import escape
 
+from dataset.layout import JOB_FILE, SELECTION
 from dataset.receipts import Receipt, make_folder
 from dataset.selection import check_split, read_selection
 from labeling.captions import read_caption_table
@@ -15,7 +16,8 @@ from labeling.ego_import import FileClock
 from labeling.errors import ConfigError
 from labeling.extractors import ExtractorChoice, Extractors, choose_extractors
 from labeling.onnx_model import resolve_providers
-from pipelines.config import EFFORTS, Config, merged, parse_config, read_yaml, with_effort
+from labeling.settings_files import read_yaml
+from pipelines.config import EFFORTS, Config, merged, parse_config, with_effort
 from pipelines.console import ConsoleReporter, counted, print_damaged, print_failures, print_twins
 from pipelines.damage import damaged_videos
 from pipelines.engine import Engine
@@ -24,7 +26,6 @@ from pipelines.imports import import_trajectories
 from pipelines.job import Job, open_job, open_or_create
 from pipelines.job_changes import job_changes
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
-from pipelines.layout import SELECTION
 from pipelines.models import check_models_folder
 from pipelines.nothing_left import clips_packed, why_nothing_is_left
 from pipelines.sources import absolute, find_videos
@@ -153,7 +154,7 @@ def prepare_job(
     check_models_folder(options.models)
     if check is not None:
         check(job)
-    if reporter is not None and (out / "job.yaml").is_file() and (words := job_changes(open_job(out), job)):
+    if reporter is not None and (out / JOB_FILE).is_file() and (words := job_changes(open_job(out), job)):
         reporter.console.print(f"[bold]{'job':>10}[/] {escape(f'{out}: {words}')}")
     make_folder(out)
     job.save()
@@ -169,7 +170,7 @@ def _refuse_file(out: Path) -> None:
 
 def _refuse_other_folder(out: Path) -> None:
     """A folder of other things (the videos, as a rule) is not to be filled with a job's."""
-    if out.is_dir() and not (out / "job.yaml").is_file():
+    if out.is_dir() and not (out / JOB_FILE).is_file():
         # What another part is just writing begins with a dot.
         others = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
         if others:

@@ -1,16 +1,13 @@
 """The settings of a job: nested, strict, in YAML; and its presets, which are functions that return one."""
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from labeling.ego_motion import EgoSettings
 from labeling.encoding import EncoderSettings, lossless_rgb
-from labeling.errors import ConfigError
-from labeling.settings_faults import settings_faults
+from labeling.settings_files import laid_over, parse_settings
 from labeling.timeline import ClipSettings
 
 Effort = Literal["fast", "balanced", "exact"]
@@ -191,7 +188,7 @@ def merged(config: Config, changes: Mapping[str, Any]) -> Config:
     Raises:
         ConfigError: a change that no setting allows.
     """
-    return parse_config(_deep_merge(config.model_dump(mode="json"), changes), "settings")
+    return parse_config(laid_over(config.model_dump(mode="json"), changes), "settings")
 
 
 def parse_config(values: Mapping[str, Any], name: str) -> Config:
@@ -201,45 +198,3 @@ def parse_config(values: Mapping[str, Any], name: str) -> Config:
         ConfigError: an unknown key, or a value out of range, with its path.
     """
     return parse_settings(Config, values, name)
-
-
-Model = TypeVar("Model", bound=BaseModel)
-
-
-def parse_settings(model: type[Model], values: Mapping[str, Any], name: str) -> Model:
-    """Any settings from plain values.
-
-    Raises:
-        ConfigError: an unknown key, or a value out of range, with its path.
-    """
-    try:
-        return model.model_validate(dict(values))
-    except ValidationError as error:
-        raise ConfigError(f"{name}: {settings_faults(model, error)}") from error
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file that holds a mapping.
-
-    Raises:
-        ConfigError: it cannot be read, is no YAML, or holds something else.
-    """
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error}); check the path") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: is no YAML ({' '.join(str(error).split())}); mend it") from error
-    if values is None:
-        return {}
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path}: needs a mapping of settings, holds {type(values).__name__}")
-    return values
-
-
-def _deep_merge(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    result = dict(values)
-    for name, change in changes.items():
-        known = result.get(name)
-        result[name] = _deep_merge(known, change) if isinstance(change, Mapping) and isinstance(known, dict) else change
-    return result

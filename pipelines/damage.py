@@ -5,11 +5,11 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from dataset.layout import parse_run_item
 from dataset.receipts import Receipt
 from labeling.errors import AnimaticError
 from pipelines.console import counted
 from pipelines.job import Job
-from pipelines.layout import parse_run_item
 
 _SHORT_S, _SHORT_SHARE = 1.0, 0.05
 """Headers round, and count sound that goes on after the pictures: a video that lacks less than both is whole."""

@@ -19,6 +19,10 @@ from labeling.ego_tracks import matched, track_run
 
 ASSUMED_SPEED_M_S = 8.0
 """Of methods that see no lengths."""
+STOCK = "stock OpenCV"
+"""Name of ``stock_opencv`` in the stability table."""
+UNCALIBRATED = "not calibrated"
+"""Name of the project's own estimate with a camera that is believed as it is told."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,7 +52,7 @@ def default_motion(clip: EgoClip, settings: EgoSettings | None = None) -> EgoMot
 
 def default_and_stock(clip: EgoClip) -> list[tuple[str, np.ndarray]]:
     """The two methods of the stability table by name, each with its (T, 4, 4) camera to world."""
-    return [("default", default_motion(clip).trajectory.cam_to_world), ("stock OpenCV", stock_opencv(clip))]
+    return [("default", default_motion(clip).trajectory.cam_to_world), (STOCK, stock_opencv(clip))]
 
 
 def constant_zero(clip: EgoClip) -> np.ndarray:

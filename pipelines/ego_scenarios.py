@@ -19,7 +19,7 @@ from pipelines.ego_errors import (
     yaw_deg,
 )
 from pipelines.ego_harm import noisy
-from pipelines.ego_methods import default_and_stock, default_motion, stock_opencv
+from pipelines.ego_methods import STOCK, UNCALIBRATED, default_and_stock, default_motion, stock_opencv
 from pipelines.stability import StabilityRow, judged
 
 
@@ -34,7 +34,7 @@ def still_noise(name: str) -> list[StabilityRow]:
         rows.append(judged(label, mode_share(motion, "still"), unit="share still", at_least=0.95))
         rows.append(judged(label, farthest_m(motion.trajectory.cam_to_world), unit="m drift", at_most=0.05))
         stock = farthest_m(stock_opencv(harmed))
-        rows.append(judged(label, stock, unit="m drift", at_most=0.05, method="stock OpenCV"))
+        rows.append(judged(label, stock, unit="m drift", at_most=0.05, method=STOCK))
     return rows
 
 
@@ -60,7 +60,7 @@ def pure_turn(name: str) -> list[StabilityRow]:
         judged(name, mode_share(motion, "turning"), unit="share turning", at_least=0.9),
         judged(name, longest_step_m(poses), unit="m a frame", at_most=0.02),
     ]
-    for method, found in (("default", poses), ("stock OpenCV", stock_opencv(clip))):
+    for method, found in (("default", poses), (STOCK, stock_opencv(clip))):
         off = 100 * abs(yaw_deg(found)[-1] / true_yaw - 1)
         rows.append(judged(name, off, unit="% of yaw", at_most=2.0, method=method))
     return rows
@@ -151,8 +151,8 @@ def focal(name: str) -> list[StabilityRow]:
         mended = calibrate_camera([tracks], intrinsics=prior).intrinsics
         found = {
             "default": solve_run(tracks, intrinsics=mended).trajectory.cam_to_world,
-            "not calibrated": solve_run(tracks, intrinsics=camera).trajectory.cam_to_world,
-            "stock OpenCV": stock_opencv(replace(clip, intrinsics=camera)),
+            UNCALIBRATED: solve_run(tracks, intrinsics=camera).trajectory.cam_to_world,
+            STOCK: stock_opencv(replace(clip, intrinsics=camera)),
         }
         for method, poses in found.items():
             ratio = yaw_deg(poses)[-1] / true

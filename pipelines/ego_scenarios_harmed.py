@@ -9,7 +9,7 @@ from dataset.conditions import Condition, compress_frames
 from pipelines.ego_clips import highway_clip, kitti_part, rolling_clip, street_clip
 from pipelines.ego_errors import path_m, typical_turn_deg, worst_turn_deg, yaw_deg
 from pipelines.ego_harm import in_condition, with_movers
-from pipelines.ego_methods import EgoClip, default_and_stock, default_motion, stock_opencv
+from pipelines.ego_methods import STOCK, EgoClip, default_and_stock, default_motion, stock_opencv
 from pipelines.ego_scenarios import mode_share
 from pipelines.stability import StabilityRow, judged
 
@@ -145,4 +145,4 @@ def _against_clean(
 
 
 def _stock_row(scenario: str, figure: float, *, unit: str, at_most: float, note: str = "") -> StabilityRow:
-    return judged(scenario, figure, unit=unit, at_most=at_most, method="stock OpenCV", note=note)
+    return judged(scenario, figure, unit=unit, at_most=at_most, method=STOCK, note=note)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+from dataset.layout import JOB_FILE
 from labeling.errors import ConfigError
 from labeling.extraction import Effort
 from labeling.extractors import ExtractorChoice, choose_extractors
@@ -66,7 +67,7 @@ def read_ruler(job: Path, options: EvaluateOptions) -> Ruler:
         ConfigError: ``job.yaml`` or an option cannot be used.
         ModelError: an extractor that was asked for has no weights.
     """
-    known = open_job(job) if (job / "job.yaml").is_file() else None
+    known = open_job(job) if (job / JOB_FILE).is_file() else None
     names, models_dir = options.extractors, options.models_dir
     effort, variant = options.effort, options.object_variant
     if known is not None:

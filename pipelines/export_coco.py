@@ -13,24 +13,25 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dataset.layout import parse_run_item, run_path
 from dataset.receipts import atomic_write, make_folder, storage_errors
 from dataset.tables import read_keypoints
 from labeling.errors import ConfigError
 from labeling.labels import Keypoints
 from labeling.schemas import keypoint_schema
+from labeling.skeleton_video import DEFAULT_STYLE
 from labeling.timeline import FPS, Span
 from labeling.video import read_frames
 from pipelines.black_skeletons import print_black_skeletons
 from pipelines.console import counted, make_console
 from pipelines.export import refuse_job_folder
 from pipelines.job import Job, open_job
-from pipelines.layout import parse_run_item, run_path
 from pipelines.stages_source import job_selection
 
 COCO_IDS = {"coco17": 1, "wholebody133": 2, "openpose18": 3, "car66": 4, "car24": 5, "lane24": 6}
 """Category ids by schema, the same in every file so that files can be joined; 1 is COCO's own person."""
 
-VISIBLE_SCORE = 0.3
+VISIBLE_SCORE = DEFAULT_STYLE.min_score
 """Points scored below are labelled but not visible: what the skeleton video does not draw."""
 
 SPLITS = ("train", "val")

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dataset.layout import index_path, trajectory_path
 from dataset.receipts import atomic_write, sha256_file
 from dataset.tables import read_index
 from labeling.ego_import import FileClock, read_drive, trajectory_format
 from labeling.errors import ConfigError, TrajectoryError
 from pipelines.job import Job
-from pipelines.layout import index_path, trajectory_path
 from pipelines.sources import ImportedTrajectory
 
 SUFFIXES = (".tum", ".kitti", ".txt")

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import shutil
 import time
 import traceback
@@ -12,6 +13,7 @@ from dataset.receipts import (
     Output,
     Receipt,
     ReceiptLog,
+    check_unaltered,
     digest,
     host_name,
     make_folder,
@@ -20,6 +22,9 @@ from dataset.receipts import (
 )
 from labeling.errors import AnimaticError, StorageError
 from pipelines.stage import DroppedError, WorkItem, load_stage
+
+_PROCESS = re.compile(r"[0-9]{1,9}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +68,10 @@ def _make(root: Path, task: Task, staging: Path, log: ReceiptLog) -> Receipt:
     item = task.item
     shutil.rmtree(staging, ignore_errors=True)
     make_folder(staging)
+    for name, sha256 in files_read(item).items():
+        # One that is not there is for the stage to tell.
+        if (root / name).is_file():
+            check_unaltered(root / name, sha256)
     facts = load_stage(item.stage).work(root, item, staging)
     base = base_receipt(task)
     if task.previous is not None and task.previous.outputs and task.previous.key != item.key:
@@ -76,11 +85,19 @@ def _make(root: Path, task: Task, staging: Path, log: ReceiptLog) -> Receipt:
     return replace(base, outputs=outputs, facts=dict(facts))
 
 
+def files_read(item: WorkItem) -> dict[str, str]:
+    """The job's files among an item's inputs, path to sha256: inputs are called by their paths, or by a name whose path
+    the payload holds."""
+    placed = {item.payload.get(name, name): value for name, value in item.inputs.items() if isinstance(value, str)}
+    return {path: value for path, value in placed.items() if "/" in path and _SHA256.fullmatch(value)}
+
+
 def sweep_staging(root: Path) -> None:
     """Remove what dead processes of this host left half-made; other hosts' process numbers may live, so theirs stay."""
     for folder in (root / ".staging").glob("*"):
         host, _, process = folder.name.rpartition(".")[2].rpartition("-")
-        if host == host_name() and not _alive(int(process)):
+        # A folder that somebody else called otherwise is not ours to remove.
+        if host == host_name() and _PROCESS.fullmatch(process) and not _alive(int(process)):
             shutil.rmtree(folder, ignore_errors=True)
     with contextlib.suppress(OSError):
         (root / ".staging").rmdir()

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import yaml
 
+from dataset.layout import JOB_FILE
 from dataset.receipts import Receipt, atomic_write, read_receipts
 from labeling.errors import ConfigError
-from pipelines.config import Config, parse_config, read_yaml
+from labeling.settings_files import read_yaml
+from pipelines.config import Config, parse_config
 from pipelines.sources import Source, absolute, read_source, same_id, source_values, with_leave_out
 from pipelines.stage import WorkItem, item_state, load_stage
 
@@ -80,7 +82,7 @@ class Job:
         if self.models_dir:
             values["models"] = str(self.models_dir)
         data = yaml.safe_dump(values, sort_keys=True, allow_unicode=True, width=120).encode()
-        path = self.root / "job.yaml"
+        path = self.root / JOB_FILE
         if not (path.is_file() and path.read_bytes() == data):
             atomic_write(path, data)
 
@@ -91,7 +93,7 @@ def open_job(root: Path) -> Job:
     Raises:
         ConfigError: there is none, or its ``job.yaml`` cannot be used.
     """
-    path = root / "job.yaml"
+    path = root / JOB_FILE
     if not path.is_file():
         raise ConfigError(f"{root}: holds no job.yaml; make a job with `animatic label VIDEO... --out {root}`")
     values = read_yaml(path)
@@ -120,7 +122,7 @@ def open_or_create(
     Raises:
         ConfigError: a video has the id of another one, no job and no videos, or a table that cannot be used.
     """
-    known = open_job(root) if (root / "job.yaml").is_file() else None
+    known = open_job(root) if (root / JOB_FILE).is_file() else None
     sources = dict(known.sources) if known else {}
     for source in videos:
         old = sources.get(source.video_id)

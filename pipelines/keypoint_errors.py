@@ -13,11 +13,11 @@ import numpy as np
 from dataset.street_labels import StreetObject
 from labeling.labels import Keypoints
 from labeling.schemas import Category
+from training.criteria import JUDGED_HEIGHT_PX, JUDGED_SHARE, LANE_MATCH_PX
 from training.metrics import pck
-from training.street_scores import JUDGED_HEIGHT_PX, distance_to_curve, is_judged, match_boxes
+from training.street_scores import distance_to_curve, is_judged, match_boxes
 
 BODIES: tuple[Category, ...] = ("car", "person")
-_LANE_MATCH_PX = 20.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,7 +107,7 @@ def point_score(matched: Iterable[MatchedFrame], *, category: Category | None = 
 
 def recall(
     matched: Iterable[MatchedFrame], *, category: Category | None = None, from_px: float = JUDGED_HEIGHT_PX,
-    to_px: float = np.inf, least_share: float = 0.3,
+    to_px: float = np.inf, least_share: float = JUDGED_SHARE,
 ) -> tuple[int, int]:  # fmt: skip
     """Objects found, and objects asked for: of a height in ``[from_px, to_px)``, ``least_share`` of them visible."""
     asked = [
@@ -126,13 +126,12 @@ def phantom_frames(matched: Sequence[MatchedFrame]) -> float:
     return sum(bool(frame.phantoms) for frame in matched) / max(1, len(matched))
 
 
-def longest_phantom(matched: Iterable[MatchedFrame]) -> int:
-    """Frames, first to last, over which one tracked phantom was shown; 0 without any."""
-    shown: dict[tuple[str, int], list[int]] = defaultdict(list)
-    for frame in matched:
-        for label in frame.phantoms:
-            shown[label.category, label.track_id].append(frame.frame)
-    return max((max(frames) - min(frames) + 1 for frames in shown.values()), default=0)
+def track_spans(labels: Iterable[Keypoints]) -> dict[int, int]:
+    """By track, the frames from its first label to its last, gaps counted."""
+    shown: dict[int, list[int]] = defaultdict(list)
+    for label in labels:
+        shown[label.track_id].append(label.frame)
+    return {track: max(frames) - min(frames) + 1 for track, frames in shown.items()}
 
 
 def lane_score(
@@ -149,7 +148,7 @@ def lane_score(
                 continue
             gaps = [float(distance_to_curve(label.points[label.present, :2], line.points_xy).mean()) for line in free]
             best = int(np.argmin(gaps)) if gaps else -1
-            if best < 0 or gaps[best] > _LANE_MATCH_PX:
+            if best < 0 or gaps[best] > LANE_MATCH_PX:
                 phantoms += 1
                 continue
             errors.append(gaps[best])

@@ -38,10 +38,13 @@ def body_extractors() -> Extractors:
 
 
 def label_clip(
-    frames: Iterable[np.ndarray], *, effort: Effort, breaks: frozenset[int] = frozenset()
-) -> list[Keypoints]:
+    frames: Iterable[np.ndarray], *, effort: Effort, breaks: frozenset[int] = frozenset(),
+    repeats: frozenset[int] = frozenset(),
+) -> list[Keypoints]:  # fmt: skip
     """Labels of consecutive frames, numbered from 0, as a job makes them."""
-    return label_frames(frames, first_frame=0, extractors=body_extractors(), effort=effort, breaks=breaks)
+    return label_frames(
+        frames, first_frame=0, extractors=body_extractors(), effort=effort, breaks=breaks, repeats=repeats
+    )
 
 
 def in_condition(clip: KeypointClip, condition: Condition, *, seed: int, amount: float | None = None) -> KeypointClip:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from dataset.receipts import Receipt
+from dataset.layout import RECEIPTS
+from dataset.receipts import Receipt, check_unaltered
 from labeling.errors import StorageError
 from pipelines.engine import Engine
 from pipelines.items import Task
@@ -72,13 +73,19 @@ def run_stage(
 
     Raises:
         NotReadyError: the stage waits for another part.
-        StorageError: the disk is full; what was made so far is kept.
+        StorageError: the disk is full, or nothing of the stage could be written; what was made so far is kept.
+        AlteredError: the selection, or the shards' index, is not as it was written.
     """
     started = time.perf_counter()
     known = job.receipts(stage)
     items = [item for item in job.plan(stage) if part is None or not item.owner or part.owns(item.owner)]
     todo = [item for item in items if force or item_state(item, known.get(item.name), job.root) != "current"]
     names = {item.name: item for item in todo}
+    for item in items:
+        # Tables of the whole job are read by later plans and by other commands, where no item compares them.
+        if not item.owner and item.name not in names:
+            for output in known[item.name].outputs:
+                check_unaltered(job.root / output.path, output.sha256)
     report = StageReport(stage=stage, current=len(items) - len(todo))
     report.failed = [
         known[item.name] for item in items if item.name not in names and known[item.name].state == "failed"
@@ -93,10 +100,19 @@ def run_stage(
     report.seconds = time.perf_counter() - started
     job.refresh()
     reporter.stage_finished(report)
+    lacking = _unwritten(report)
     if len(report.made) < len(todo):
-        full = next(receipt for receipt in report.failed if receipt.reason == StorageError.reason)
-        raise StorageError(f"{full.message} ({stage} stopped with {len(todo) - len(report.made)} items to go)")
+        raise StorageError(f"{lacking[0].message} ({stage} stopped with {len(todo) - len(report.made)} items to go)")
+    if lacking and len(lacking) == len(items):
+        # What comes after would pack nothing, and give another reason for it.
+        raise StorageError(f"{lacking[0].message} ({stage} could write nothing)")
     return report
+
+
+def _unwritten(*reports: StageReport) -> list[Receipt]:
+    """What failed in this call because it could not be written."""
+    made = (receipt for report in reports for receipt in report.made)
+    return [receipt for receipt in made if receipt.state == "failed" and receipt.reason == StorageError.reason]
 
 
 def run_stages(
@@ -122,11 +138,19 @@ def run_stages(
 
     Raises:
         NotReadyError: the other parts made no progress for ``patience_s``.
-        StorageError: the disk is full.
+        StorageError: the disk is full, or a stage waits for what could not be written.
     """
-    reports = []
+    reports: list[StageReport] = []
     for stage in stages:
-        _wait_for_parts(job, stage, reporter, patience_s if part is not None and part.count > 1 else 0.0)
+        lacking = _unwritten(*reports)
+        patient = part is not None and part.count > 1 and not lacking
+        try:
+            _wait_for_parts(job, stage, reporter, patience_s if patient else 0.0)
+        except NotReadyError as error:
+            if not lacking:
+                raise
+            # Not even the receipts of these may have been written: no other part is to blame.
+            raise StorageError(f"{lacking[0].message} ({stage} waits for {len(lacking)} that failed)") from error
         reports.append(run_stage(job, stage, engine, reporter, part=part, force=refreeze and stage == "select"))
     return reports
 
@@ -151,7 +175,7 @@ def _wait_for_parts(job: Job, stage: str, reporter: Reporter, patience_s: float)
 
 def _progress(root: Path) -> tuple[tuple[str, int], ...]:
     """Sizes of all receipt logs: they grow while any part lives."""
-    logs = sorted((root / "receipts").glob("*/*.jsonl"))
+    logs = sorted((root / RECEIPTS).glob("*/*.jsonl"))
     return tuple((str(log.relative_to(root)), log.stat().st_size) for log in logs)
 
 

@@ -73,7 +73,7 @@ def object_boxes(card: SimccCard, pictures: Sequence[np.ndarray], *, models_dir:
 
 
 def print_check(name: str, images: Sequence[Path], *, models_dir: Path | None, as_json: bool = False) -> int:
-    """Check one card and show every way it was tried; 1 where another way fits better.
+    """Check one card and show every way it was tried; 1 where another way fits better, or its own fails.
 
     Raises:
         ConfigError: no such folder or card, a picture that cannot be read, or, for a head, no box to look at.
@@ -96,7 +96,7 @@ def print_check(name: str, images: Sequence[Path], *, models_dir: Path | None, a
     check = check_card(card, path, pictures, boxes_xyxy=boxes)
     if as_json:
         print(json.dumps(dataclasses.asdict(check), indent=1))
-        return int(check.verdict == "another fits better")
+        return int(check.verdict in ("another fits better", "fails"))
     console = make_console()
     table = Table(box=None, pad_edge=False)
     for column in ("fed as", "objects", "sum of scores", ""):
@@ -106,6 +106,6 @@ def print_check(name: str, images: Sequence[Path], *, models_dir: Path | None, a
         table.add_row(one.name, str(one.objects), f"{one.evidence:.2f}", remark, style="bold" if one.is_card else "")
     console.print(f"{path}; providers {', '.join(check.providers)}")
     console.print(table)
-    colour = {"fits": "green", "another fits better": "red", "unclear": "yellow"}[check.verdict]
+    colour = {"fits": "green", "another fits better": "red", "unclear": "yellow", "fails": "red"}[check.verdict]
     console.print(f"[{colour}]{check.verdict}[/]: {escape(check.advice)}")
-    return int(check.verdict == "another fits better")
+    return int(check.verdict in ("another fits better", "fails"))

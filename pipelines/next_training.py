@@ -5,10 +5,10 @@ Read from names and headers of files alone, since the modules that write them lo
 
 from pathlib import Path
 
+from dataset.layout import LATENTS, SHARD_INDEX
 from dataset.shards import read_shard_index
 from labeling.errors import ModelError
 from pipelines.console import counted
-from pipelines.layout import SHARD_INDEX
 from training.adapter_notes import adapter_file, read_progress
 from training.config import BACKBONES, config_names
 
@@ -19,7 +19,7 @@ _NOT_HERE = "its weights are not on this machine, `--backbone tiny` tries all st
 def next_training(root: Path) -> tuple[str, str]:
     """The next command, and why."""
     keys = {row.key for row in read_shard_index(root / SHARD_INDEX)}
-    stores = sorted(path.parent for path in (root / "latents").glob("*/cache.json"))
+    stores = sorted(path.parent for path in (root / LATENTS).glob("*/cache.json"))
     if not stores:
         others = ", ".join(name for name in BACKBONES if name != "ltx-2b")
         return (

@@ -17,7 +17,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from dataset.inspection import SHEET_ROWS, Summary, contact_sheet, find_sample, summarize
+from dataset.contact_sheet import SHEET_ROWS, contact_sheet
+from dataset.inspection import Summary, find_sample, summarize
+from dataset.layout import REPORT, SELECTION, SHARD_INDEX
 from dataset.loader import Sample, ShardDataset
 from dataset.receipts import atomic_write
 from dataset.selection import Selection, read_selection
@@ -25,7 +27,6 @@ from labeling.encoding import EncoderSettings, VideoWriter
 from labeling.errors import DataError
 from pipelines.console import duration, file_size
 from pipelines.job import open_job
-from pipelines.layout import REPORT, SELECTION
 from pipelines.status import JobStatus, failure_lines, job_status, videos_words
 
 _TEMPLATE = Path(__file__).with_name("templates") / "report.html"
@@ -130,7 +131,7 @@ def _label_sections(root: Path, status: JobStatus, summary: Summary) -> list[Sec
             Section(
                 title="Clips at a glance",
                 pictures=[
-                    Picture(data=png_data(contact_sheet(clip)), caption=f"{clip.key}: eight moments")
+                    Picture(data=png_data(contact_sheet(clip)), caption=f"{clip.key}: four moments")
                     for clip in _some_clips(root)
                 ],
             )
@@ -292,7 +293,7 @@ def draw_trajectories(root: Path, *, most: int = 200) -> np.ndarray:
 
 
 def _packed(root: Path) -> bool:
-    return (root / "shards" / "index.parquet").is_file()
+    return (root / SHARD_INDEX).is_file()
 
 
 def draw_losses(curves: Mapping[str, Sequence[float]]) -> np.ndarray:

@@ -7,21 +7,22 @@ import numpy as np
 from dataset.street_labels import StreetObject
 from labeling.labels import Keypoints
 from pipelines.keypoint_errors import MatchedFrame
-from training.street_scores import PCK_SHARE, is_judged
+from training.criteria import PCK_SHARE
+from training.street_scores import is_judged
 
 
 def scored_points(matched: Iterable[MatchedFrame]) -> np.ndarray:
-    """(N, 2) float64: score, and 1 or 0 for right or wrong, of every point that is present.
+    """(N, 3) float64: score, 1 or 0 for right or wrong, 1 or 0 for hidden or not, of every point that is present.
 
     Counted are judged objects that were found, hidden points too: a place is right wherever the car's own point lies.
-    All points of phantoms are wrong.
+    All points of phantoms are wrong, and none is hidden.
     """
-    rows = [np.zeros((0, 2))]
+    rows = [np.zeros((0, 3))]
     for frame in matched:
         rows += [_of_object(thing, label) for thing, label in frame.pairs if label is not None and is_judged(thing)]
-        rows += [
-            np.column_stack([label.points[label.present, 2], np.zeros(label.present.sum())]) for label in frame.phantoms
-        ]
+        for label in frame.phantoms:
+            nothing = np.zeros(label.present.sum())
+            rows.append(np.column_stack([label.points[label.present, 2], nothing, nothing]))
     return np.concatenate(rows)
 
 
@@ -30,4 +31,4 @@ def _of_object(thing: StreetObject, label: Keypoints) -> np.ndarray:
     known = np.isfinite(thing.points_xy).all(axis=1) & label.present[:count]
     distance = np.linalg.norm(label.points[:count, :2] - np.nan_to_num(thing.points_xy), axis=1)
     right = distance <= PCK_SHARE * np.hypot(*(thing.box_xyxy[2:] - thing.box_xyxy[:2]))
-    return np.column_stack([label.points[:count, 2], right])[known]
+    return np.column_stack([label.points[:count, 2], right, ~thing.visible])[known]

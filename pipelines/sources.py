@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from dataset.layout import JOB_FILE
 from labeling.errors import AnimaticError, ConfigError
 from labeling.timeline import LONGEST_VIDEO_ID, check_video_id
 from pipelines.given_tables import read_leave_out, two_lengths
@@ -178,7 +179,7 @@ def _files_below(folder: Path, out: Path | None) -> Iterator[Path]:
 
 def _is_job(folder: Path, out: Path | None) -> bool:
     """Whether a folder is a job's, or about to be."""
-    return (folder / "job.yaml").is_file() or (out is not None and folder.resolve() == out.resolve())
+    return (folder / JOB_FILE).is_file() or (out is not None and folder.resolve() == out.resolve())
 
 
 def _read_list(path: Path) -> list[_Named]:

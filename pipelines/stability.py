@@ -10,7 +10,7 @@ from typing import Literal
 from dataset.receipts import atomic_write, storage_errors, try_folder
 from labeling.errors import ConfigError
 from pipelines.charts import machine_name
-from pipelines.reliability import ReliabilityCurve, draw_reliability
+from pipelines.reliability import ReliabilityBin, ReliabilityCurve, draw_reliability
 
 STABILITY: dict[str, str] = {
     "ego": "pipelines.stability_ego",
@@ -27,8 +27,8 @@ class StabilityRow:
 
     scenario: str
     method: str
-    figure: float | None
-    """What was measured; None where the method gave no answer and said so."""
+    figure: float
+    """What was measured."""
     unit: str
     bound: str
     """As a person reads it, such as ``<= 0.1``."""
@@ -46,6 +46,13 @@ class StabilityTable:
     rows: tuple[StabilityRow, ...]
     curves: tuple[ReliabilityCurve, ...] = ()
     """Whether scores can be believed, where the stage gives scores; drawn as ``reliability-<stage>.png``."""
+    references: tuple[str, ...] = ()
+    """Methods that stand beside ours for comparison; where they fail, nothing of ours does."""
+
+    @property
+    def failed(self) -> tuple[StabilityRow, ...]:
+        """The rows of our own methods whose bound is not held."""
+        return tuple(row for row in self.rows if row.verdict == "not held" and row.method not in self.references)
 
 
 def judged(
@@ -88,16 +95,35 @@ def run_stability(name: str, *, out: Path, quick: bool = False) -> StabilityTabl
 def write_stability(table: StabilityTable, out: Path) -> None:
     """``stability-<stage>.json`` in the folder ``out``, and where the table has curves ``reliability-<stage>.png``."""
     values = asdict(table)
-    if not table.curves:
-        values.pop("curves")
+    for optional in ("curves", "references"):
+        if not values[optional]:
+            values.pop(optional)
     text = json.dumps(values, indent=1, ensure_ascii=False) + "\n"
     atomic_write(out / f"stability-{table.stage}.json", text.encode())
     if table.curves:
-        picture = out / f"reliability-{table.stage}.png"
-        with storage_errors(picture):
-            draw_reliability(table.curves, picture, title=f"{table.stage}: can scores be believed?", note=table.data)
+        draw_curves(table, out)
 
 
-def make_table(stage: str, data: str, rows: Sequence[StabilityRow]) -> StabilityTable:
+def draw_curves(table: StabilityTable, out: Path) -> None:
+    """``reliability-<stage>.png`` in the folder ``out``."""
+    picture = out / f"reliability-{table.stage}.png"
+    with storage_errors(picture):
+        draw_reliability(table.curves, picture, title=f"{table.stage}: what a score says", note=table.data)
+
+
+def read_stability(path: Path) -> StabilityTable:
+    """A table as ``write_stability`` wrote it, to be drawn again without being measured again."""
+    values = json.loads(path.read_text(encoding="utf-8"))
+    rows = tuple(StabilityRow(**row) for row in values.pop("rows"))
+    curves = tuple(
+        ReliabilityCurve(**curve | {"bins": tuple(ReliabilityBin(**one) for one in curve["bins"])})
+        for curve in values.pop("curves", [])
+    )
+    return StabilityTable(**values, rows=rows, curves=curves)
+
+
+def make_table(
+    stage: str, data: str, rows: Sequence[StabilityRow], *, references: tuple[str, ...] = ()
+) -> StabilityTable:
     """A table measured on this machine."""
-    return StabilityTable(stage=stage, data=data, machine=machine_name(), rows=tuple(rows))
+    return StabilityTable(stage=stage, data=data, machine=machine_name(), rows=tuple(rows), references=references)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pipelines import ego_scenarios as moved
 from pipelines import ego_scenarios_harmed as harmed
 from pipelines.ego_clips import SECONDS
+from pipelines.ego_methods import STOCK, UNCALIBRATED
 from pipelines.stability import StabilityRow, StabilityTable, make_table
 
 _SCENARIOS: dict[str, Callable[[str], list[StabilityRow]]] = {
@@ -44,4 +45,4 @@ def stability(*, quick: bool = False) -> StabilityTable:
         if not quick or name in _QUICK:
             rows += play(name)
     data = f"street drives of {SECONDS} s at 24 fps with exact truth; KITTI 03 at half size where it is named"
-    return make_table("ego", data, rows)
+    return make_table("ego", data, rows, references=(STOCK, UNCALIBRATED))

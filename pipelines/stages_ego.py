@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from dataset.cameras import read_camera, road_record, write_camera
+from dataset.layout import camera_path, index_path, parse_run_item, run_path
 from dataset.receipts import Output, Receipt, sha256_file
 from dataset.tables import VideoIndex, read_ego, read_frames_table, read_index, read_keypoints, write_ego
 from labeling.camera import Intrinsics, metadata_intrinsics, prior_intrinsics
@@ -29,7 +30,6 @@ from labeling.timeline import Span
 from labeling.video import read_frames
 from pipelines.config import CameraSettings, EgoStageSettings, PictureSettings, video_camera
 from pipelines.job import Job
-from pipelines.layout import camera_path, index_path, parse_run_item, run_path
 from pipelines.sources import ImportedTrajectory
 from pipelines.stage import WorkItem
 from pipelines.stages_labels import run_breaks

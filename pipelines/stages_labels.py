@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dataset.layout import parse_run_item, run_path
 from dataset.receipts import digest
 from dataset.tables import read_frames_table, write_keypoints
 from labeling.errors import DataError
@@ -16,7 +17,6 @@ from labeling.timeline import RunFrames
 from labeling.video import read_frames
 from pipelines.config import KeypointSettings
 from pipelines.job import Job
-from pipelines.layout import parse_run_item, run_path
 from pipelines.stage import WorkItem
 from pipelines.stages_select import job_extractors, model_hashes
 
@@ -39,7 +39,7 @@ class KeypointsStage:
             video_id, run = parse_run_item(name)
             items.append(
                 WorkItem(
-                    stage=self.name, name=name, owner=video_id, version=3, settings=settings, models=models,
+                    stage=self.name, name=name, owner=video_id, version=4, settings=settings, models=models,
                     inputs={output.path: output.sha256 for output in receipt.outputs},
                     outputs=(run_path(video_id, run, ".keypoints.parquet"),), weight=float(len(run)),
                     payload={"models_dir": str(job.models_dir) if job.models_dir else None},
@@ -63,6 +63,7 @@ class KeypointsStage:
             labels = label_frames(
                 read_frames(root / run_path(video_id, run, ".mp4")), first_frame=run.start,
                 extractors=extractors, effort=item.settings["keypoints"]["effort"], breaks=run_breaks(frames),
+                repeats=frozenset(frames.frame[frames.duplicate].tolist()),
             )  # fmt: skip
             left_out = {name: count - before[name] for name, count in extractors.left_out.items()}
         outside = [label.frame for label in labels if not run.start <= label.frame < run.end]

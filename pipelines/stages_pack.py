@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from dataset.receipts import Output, digest
+from dataset.layout import INDEX_NAME, SHARD_INDEX, SHARDS, clip_path, index_path, parse_run_item, run_path, shard_path
+from dataset.receipts import Output, check_unaltered, digest
 from dataset.selection import ClipRow
 from dataset.shards import (
     ClipSize,
@@ -28,7 +29,6 @@ from labeling.labels import Keypoints
 from labeling.timeline import FPS, RunFrames, Span, copy_clip
 from pipelines.config import PictureSettings
 from pipelines.job import Job
-from pipelines.layout import SHARD_INDEX, clip_path, index_path, parse_run_item, run_path, shard_path
 from pipelines.stage import NotReadyError, WorkItem
 from pipelines.stages_source import job_selection, picture_map
 from pipelines.stages_views import clip_labels, clip_trajectory, find_run
@@ -71,7 +71,11 @@ class PackStage:
         ]  # fmt: skip
 
     def work(self, root: Path, item: WorkItem, staging: Path) -> Mapping[str, Any]:
-        """Write one tar and its rows of the index."""
+        """Write one tar and its rows of the index.
+
+        Raises:
+            AlteredError: a clip's run or view is not as it was written.
+        """
         keys = tuple(item.inputs["clips"])
         plan = ShardPlan(name=item.name, split=item.inputs["split"], keys=keys)
         samples = ((key, _members(root, staging, item, key)) for key in keys)
@@ -103,6 +107,7 @@ class ShardIndexStage:
             WorkItem(
                 stage=self.name, name="index", owner="", version=1, settings={},
                 inputs={name: output.sha256 for name, output in rows.items()}, outputs=(SHARD_INDEX,),
+                payload={name: output.path for name, output in rows.items()},
             )
         ]  # fmt: skip
 
@@ -111,8 +116,8 @@ class ShardIndexStage:
         rows: list[Member] = []
         for name in item.inputs:
             rows += read_shard_index(root / _rows_path(name))
-        write_shard_index(staging / "index.parquet", rows)
-        for path in (root / "shards").glob("*.tar"):
+        write_shard_index(staging / INDEX_NAME, rows)
+        for path in (root / SHARDS).glob("*.tar"):
             if path.name not in item.inputs:
                 path.unlink(missing_ok=True)
                 (root / _rows_path(path.name)).unlink(missing_ok=True)
@@ -143,10 +148,16 @@ def _packable(job: Job) -> dict[str, dict[str, Any]]:
         whole = [output for stage in done for output in (done[stage][name].outputs if name in done[stage] else ())]
         share = len(row.span) / len(run)
         size = sum(round(output.size * share) for output in whole) + sum(output.size for output in receipt.outputs)
+        files = [job.done("index")[row.video_id].output("index.parquet"), *whole, *receipt.outputs]
         clips[key] = {
             "size": ClipSize(key=key, split=row.split or "train", round=row.round, size=size),
             "digest": _clip_digest(job, row, [*whole, *receipt.outputs]),
-            "payload": {"run": name, "clip": [row.start, row.end], "objects": row.objects},
+            "payload": {
+                "run": name,
+                "clip": [row.start, row.end],
+                "objects": row.objects,
+                "files": {output.path: output.sha256 for output in files},
+            },
         }
     return clips
 
@@ -158,8 +169,14 @@ def _clip_digest(job: Job, row: ClipRow, files: list[Output]) -> str:
 
 
 def _members(root: Path, staging: Path, item: WorkItem, key: str) -> SampleMembers:
-    """A sample's members, each made when its turn comes."""
+    """A sample's members, each made when its turn comes.
+
+    Raises:
+        AlteredError: a file that they are made from is not as it was written.
+    """
     payload = item.payload["clips"][key]
+    for path, sha256 in payload["files"].items():
+        check_unaltered(root / path, sha256)
     video_id, run = parse_run_item(payload["run"])
     clip = Span(start=payload["clip"][0], end=payload["clip"][1])
     labels = clip_labels(root, video_id, run, clip)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dataset.layout import JOB_FILE, SELECTION, counts_path, index_path
 from dataset.receipts import digest, reason_counts
 from dataset.selection import (
     ClipRow,
@@ -24,11 +25,11 @@ from labeling.errors import ConfigError, DataError, VideoError
 from labeling.extractors import ExtractorChoice, choose_extractors
 from labeling.model_cards import find_weights, load_cards
 from labeling.onnx_files import weights_sha256
+from labeling.settings_files import parse_settings
 from labeling.timeline import ClipPlan, ClipSettings, Timeline, plan_clips, plan_timeline
 from labeling.video import decode_at
-from pipelines.config import CountSettings, PictureSettings, SelectSettings, parse_settings
+from pipelines.config import CountSettings, PictureSettings, SelectSettings
 from pipelines.job import Job
-from pipelines.layout import SELECTION, counts_path, index_path
 from pipelines.stage import NotReadyError, WorkItem
 from pipelines.stages_source import picture_map
 
@@ -273,7 +274,7 @@ def _refuse_passing_failures(job: Job) -> None:
             if receipt.state == "failed" and receipt.retryable and receipt.reason != "fault":
                 raise NotReadyError(
                     f"{receipt.item} is not counted: {receipt.message}; run the command again, or take the video out "
-                    f"of {job.root / 'job.yaml'} to go on without it"
+                    f"of {job.root / JOB_FILE} to go on without it"
                 )
 
 

@@ -5,6 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from dataset.layout import SELECTION, index_path, run_item, run_path
 from dataset.receipts import Receipt, sha256_file
 from dataset.selection import Selection, read_selection
 from dataset.tables import VideoIndex, read_index, write_frames, write_index
@@ -15,7 +16,6 @@ from labeling.timeline import Span, cut_run, plan_runs, plan_timeline
 from labeling.video import PacketTimes, VideoInfo, frame_count, probe, read_packet_times
 from pipelines.config import PictureSettings
 from pipelines.job import Job
-from pipelines.layout import SELECTION, index_path, run_item, run_path
 from pipelines.sources import Source
 from pipelines.stage import NotReadyError, WorkItem
 
@@ -123,7 +123,7 @@ class CutStage:
             for run in runs:
                 items.append(
                     WorkItem(
-                        stage=self.name, name=run_item(video_id, run), owner=video_id, version=1, settings=settings,
+                        stage=self.name, name=run_item(video_id, run), owner=video_id, version=2, settings=settings,
                         inputs={"index": index[video_id].output("index.parquet").sha256, "run": [run.start, run.end]},
                         outputs=(run_path(video_id, run, ".mp4"), run_path(video_id, run, ".frames.parquet")),
                         payload={"path": str(job.sources[video_id].path), "index": index_path(video_id)},

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dataset.layout import clip_path, parse_run_item, run_item, run_path
 from dataset.receipts import Output
 from dataset.selection import ClipRow
 from dataset.tables import EgoTable, read_ego, read_frames_table, read_keypoints
@@ -22,7 +23,6 @@ from labeling.timeline import FPS, Span, clip_fault
 from labeling.video import frame_count
 from pipelines.config import PictureSettings, ViewSettings
 from pipelines.job import Job
-from pipelines.layout import clip_path, parse_run_item, run_item, run_path
 from pipelines.stage import DroppedError, WorkItem
 from pipelines.stages_source import job_selection
 

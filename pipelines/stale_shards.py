@@ -6,9 +6,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
+from dataset.layout import JOB_FILE, SHARD_INDEX
 from labeling.errors import AnimaticError
 from pipelines.job import open_job
-from pipelines.layout import SHARD_INDEX
 from pipelines.nothing_left import clips_packed
 from pipelines.stage import NotReadyError
 
@@ -18,7 +18,7 @@ def stale_shards(root: Path) -> str:
 
     Read from plans and receipts, as ``animatic status`` does; nothing is opened but tables.
     """
-    if not ((root / "job.yaml").is_file() and (root / SHARD_INDEX).is_file()):
+    if not ((root / JOB_FILE).is_file() and (root / SHARD_INDEX).is_file()):
         return ""
     told = (
         "shards are older than the job's settings, videos or models as they are here; "

@@ -9,16 +9,9 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from dataset.inspection import (
-    Spread,
-    Summary,
-    clip_record,
-    contact_sheet,
-    drop_reasons,
-    find_sample,
-    packed_keys,
-    summarize,
-)
+from dataset.contact_sheet import contact_sheet
+from dataset.inspection import Spread, Summary, clip_record, drop_reasons, find_sample, packed_keys, summarize
+from dataset.layout import JOB_FILE, SELECTION, SHARD_INDEX
 from dataset.pictures import write_picture
 from dataset.receipts import read_receipts, reason_counts
 from dataset.selection import read_selection
@@ -27,7 +20,6 @@ from pipelines.black_skeletons import black_skeletons, print_black_skeletons
 from pipelines.console import counted, dropped_words, file_size, make_console, print_damaged, shortened
 from pipelines.damage import damaged_videos
 from pipelines.job import Job, open_job
-from pipelines.layout import SELECTION, SHARD_INDEX
 from pipelines.next_training import next_training
 from pipelines.nothing_left import clips_packed, why_nothing_is_left
 from pipelines.stage import COMMAND_STAGES, item_state
@@ -273,7 +265,7 @@ def _print_summary(root: Path, summary: Summary) -> None:
     for name, text in rows.items():
         table.add_row(name, escape(text))
     console.print(table)
-    if (root / "job.yaml").is_file():
+    if (root / JOB_FILE).is_file():
         print_damaged(damaged_videos(open_job(root)), console)
     print_black_skeletons(root, console)
     print_stale_shards(root, console)
@@ -285,7 +277,7 @@ def _print_summary(root: Path, summary: Summary) -> None:
 
 def videos_words(root: Path, summary: Summary) -> str:
     """How many videos a job has, and of how many of them the summary is."""
-    videos = len(open_job(root).sources) if (root / "job.yaml").is_file() else summary.videos
+    videos = len(open_job(root).sources) if (root / JOB_FILE).is_file() else summary.videos
     if videos <= summary.videos:
         return counted(summary.videos, "video")
     return f"{counted(videos, 'video')}, {summary.videos} of them indexed"

@@ -28,7 +28,7 @@ from training.study_base import open_backbone, save_denoiser, save_vae
 from training.study_judge import PAIR_FRAMES, Judge, JudgeClip, Reading, is_counted, load_judge, train_judge
 from training.study_plan import ARMS, JUDGED_EVERY, QUESTIONS, Arm, StudyPlan, plan_study
 from training.study_scores import FIGURES, TrueTrack, clip_scores, true_tracks
-from training.study_verdicts import SAME_SHARE, Gate, find, judge_gate, paired_interval, table_of
+from training.study_verdicts import SAME_SHARE, Gate, crossed_interval, find, judge_gate, table_of
 
 HEADLINE = "keypoint_error"
 """The figure whose verdict answers a question; the others stand beside it."""
@@ -125,7 +125,8 @@ def run_study(
         ConfigError: the folder holds a study of another plan, or a budget too small; a report with nothing to report.
         StorageError: the folder cannot be written to.
     """
-    from pipelines.study_report import draw_intervals, draw_sheet
+    from pipelines.study_picture import draw_study
+    from pipelines.study_report import draw_sheet
 
     plan = plan_study(quick=quick) if minutes is None else plan_study(minutes, quick=quick)
     study = Study(plan=plan, out=out, say=say)
@@ -139,7 +140,7 @@ def run_study(
                     study.recorded(_arm_record(arm, seed), lambda arm=arm, seed=seed: run_arm(study, arm, seed))
         result = conclude(study, seeds=_complete_seeds(study))
         atomic_write(out / "study.json", (json.dumps(result, indent=1, sort_keys=True) + "\n").encode())
-        draw_intervals(result, out / "study.png")
+        draw_study(result, out / "study.png")
         draw_sheet(out / "shown", out / "study-sheet.png")
     return result
 
@@ -325,7 +326,7 @@ def conclude(study: Study, *, seeds: Sequence[int]) -> dict[str, Any]:
         questions.append(
             {**asdict(question), "verdict": findings[question.name][HEADLINE]["verdict"],
              "figures": findings[question.name],
-             "apd_difference_m": asdict(paired_interval(apart))}
+             "apd_difference_m": asdict(crossed_interval(apart))}
         )  # fmt: skip
     rows = {name: _means(seeds, keys) for name, seeds in arms.items()}
     rows |= {f"[{name}]": _means([scores], keys) for name, scores in truth.items()}
@@ -375,7 +376,7 @@ def _clips(study: Study, arm: Arm, seed: int) -> Scores:
 def _means(seeds: Sequence[Scores], keys: Sequence[str]) -> dict[str, Any]:
     """Mean and interval of every figure that an arm has."""
     figures = sorted({name for scores in seeds for row in scores.values() for name in row})
-    intervals: dict[str, Interval] = {name: paired_interval(table_of(seeds, name, keys)) for name in figures}
+    intervals: dict[str, Interval] = {name: crossed_interval(table_of(seeds, name, keys)) for name in figures}
     return {name: asdict(interval) for name, interval in intervals.items()}
 
 

@@ -1,4 +1,4 @@
-"""The study's results as a person sees them: a table, a chart of intervals, a contact sheet."""
+"""The study's results as a person sees them: a table and a contact sheet."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,12 +12,7 @@ from rich.table import Table
 
 from dataset.pictures import write_picture
 
-_COLOURS = {"better": "#2f855a", "worse": "#c53030", "no difference": "#2b6cb0", "inconclusive": "#a0aec0"}
 _STYLES = {"better": "green", "worse": "red", "no difference": "blue", "inconclusive": "dim"}
-_TITLES = {
-    "keypoint_error": "keypoint error (box corners), px", "track_survival": "track survival, share of the clip",
-    "min_ade": "minADE, m",
-}  # fmt: skip
 _ORDER = ("truth", "through the VAE", "first frame held")
 
 
@@ -46,39 +41,6 @@ def print_result(result: Mapping[str, Any], console: Console) -> None:
     for gate in result["judge"].values():
         console.print(f"{gate['figure'].replace('_', ' ')}: {escape(gate['reason'])}")
     console.print(f"{result['processor_s']['in all'] / 60:.1f} processor minutes on {result['machine']}")
-
-
-def draw_intervals(result: Mapping[str, Any], path: Path) -> None:
-    """A panel per figure, a row per question: the paired difference with its interval, coloured by verdict."""
-    from matplotlib.figure import Figure
-
-    questions = result["questions"]
-    figure = Figure(figsize=(12, 4.6), dpi=120, layout="constrained")
-    panels = figure.subplots(1, len(_TITLES), sharey=True)
-    for panel, (name, title) in zip(panels, _TITLES.items(), strict=True):
-        panel.axvline(0, color="#4a5568", linewidth=0.8)
-        for row, question in enumerate(questions):
-            finding = question["figures"][name]
-            gap = finding["difference"]
-            colour = _COLOURS[finding["verdict"]]
-            panel.plot([gap["low"], gap["high"]], [row, row], color=colour, linewidth=3, solid_capstyle="round")
-            panel.plot(gap["mean"], row, "o", color=colour, markersize=7)
-            panel.annotate(finding["verdict"], (gap["mean"], row), xytext=(0, 8), textcoords="offset points",
-                           ha="center", fontsize=8, color=colour)  # fmt: skip
-        panel.set_title(title, fontsize=10)
-        panel.set_xlabel("second better   |   first better", fontsize=8)
-        panel.margins(x=0.15)
-        panel.grid(axis="x", alpha=0.25)
-        panel.spines[["top", "right"]].set_visible(False)
-    panels[0].set_yticks(range(len(questions)), [question["text"] for question in questions], fontsize=9)
-    panels[0].set_ylim(len(questions) - 0.5, -0.6)
-    plan = result["plan"]
-    figure.suptitle(
-        f"animatic study: {len(result['seeds'])} seeds, {plan['scale']['val_clips']} streets, "
-        f"{result['processor_s']['in all'] / 60:.0f} processor minutes; paired 95 % intervals", fontsize=11,
-    )  # fmt: skip
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
 
 
 def draw_sheet(folder: Path, path: Path) -> None:

@@ -14,9 +14,9 @@ from labeling.model_cards import YoloxCard, find_weights, load_cards
 from labeling.skeleton_reading import skeletons_from_frame
 from labeling.skeleton_video import draw_skeletons
 from pipelines.study_data import StudyClip
+from training.criteria import MATCH_IOU
 from training.metrics import ade_m
 from training.study_judge import is_counted
-from training.study_scores import MATCH_IOU
 
 _UPSCALED = 4
 _MOST_CLIPS = 6

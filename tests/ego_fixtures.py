@@ -1,9 +1,11 @@
 """Corner tracks of a made-up street with exact truth: no pictures, so that geometry is tested alone and in no time."""
 
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from labeling.camera import Intrinsics, invert, rigid
+from labeling.camera import Intrinsics, Trajectory, invert, rigid
 from labeling.ego_corners import FrameTracks
 from labeling.ego_tracks import RunTracks
 
@@ -15,6 +17,11 @@ def camera(focal_px: float = 640.0) -> Intrinsics:
     return Intrinsics(
         width=WIDTH, height=HEIGHT, fx=focal_px, fy=focal_px, cx=(WIDTH - 1) / 2, cy=(HEIGHT - 1) / 2, source="given"
     )
+
+
+def write_kitti(trajectory: Trajectory, path: Path) -> None:
+    """A row-major 3x4 camera-to-world matrix per row; KITTI's files carry no times."""
+    np.savetxt(path, trajectory.cam_to_world[:, :3].reshape(-1, 12), fmt="%.9e")
 
 
 def driven(

@@ -73,6 +73,14 @@ def constant_model(
     return save_graph(path, nodes, inputs=inputs, outputs=shapes, weights=weights)
 
 
+def deaf_model(path: Path, card: ModelCard, output: np.ndarray) -> Path:
+    """A graph that gives one row, ``output``, for a batch of any size, and states another."""
+    node = helper.make_node("Identity", ["rows"], ["output"])
+    inputs = {"images": ["batch", 3, card.input_height, card.input_width]}
+    outputs = {"output": ["rows", *output.shape]}
+    return save_graph(path, [node], inputs=inputs, outputs=outputs, weights={"rows": output[None].astype(np.float32)})
+
+
 def random_simcc(path: Path, *, points: int, width: int, height: int, seed: int = 0, batch: Batch = "batch") -> Path:
     """A SimCC head of random weights: one strided convolution, then a linear layer per axis."""
     rng = np.random.default_rng(seed)

@@ -9,6 +9,7 @@ from onnx import helper
 from onnx_fixtures import constant_model, save_graph
 from pipeline_fixtures import SMALL, run_all, small_config, write_detector, write_street
 
+from dataset.layout import run_path
 from dataset.receipts import read_receipts
 from dataset.tables import read_keypoints
 from labeling.errors import ModelError
@@ -19,7 +20,6 @@ from pipelines.commands import JobOptions, run_label
 from pipelines.console import ConsoleReporter
 from pipelines.job import Job
 from pipelines.label import StageReport
-from pipelines.layout import run_path
 from pipelines.models import print_models
 from pipelines.sources import find_videos
 

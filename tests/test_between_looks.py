@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from moving_card import MovingCard
 
-from labeling.between_looks import BetweenLooks
+from labeling.between_looks import BetweenLooks, cut_at_border
 from labeling.carrying import small_grey
 from labeling.labels import Keypoints
 
@@ -22,7 +23,7 @@ def seen(frame: int, *, track_id: int = 0) -> Keypoints:
 
 def carried_to(end: int, *, first: list[Keypoints], shown: int = 4) -> BetweenLooks:
     """A look at frame 0 whose objects flow has taken to ``end``, two frames a step."""
-    between = BetweenLooks(flow_step=2, shown_frames=shown)
+    between = BetweenLooks(flow_step=2, shown_frames=shown, clocks=range(end + 1))
     between.start(first, frame=0, grey=grey(0))
     for frame in range(2, end + 1, 2):
         assert between.due(frame) and not between.due(frame - 1)
@@ -42,9 +43,18 @@ def test_a_lost_object_is_carried_on_for_a_while() -> None:
     assert [label.frame for label in labels] == [1, 2, 3, 4]
 
 
+@pytest.mark.parametrize("pace", [1, 2])
+def test_how_long_it_is_carried_goes_by_the_clock(pace: int) -> None:
+    """Pictures that are each shown for two frames of the grid make half as many."""
+    between = carried_to(8, first=[seen(0)])
+    between.clocks = range(0, 9 * pace, pace)
+    labels, _ = between.close([], frame=8)
+    assert [label.frame for label in labels] == [1, 2, 3, 4][: 4 // pace]
+
+
 def test_what_flow_lost_is_not_shown_on() -> None:
     """Something steps before an object: flow loses it, and the next look does not see it."""
-    between = BetweenLooks(flow_step=2, shown_frames=4)
+    between = BetweenLooks(flow_step=2, shown_frames=4, clocks=range(7))
     between.start([seen(0)], frame=0, grey=grey(0))
     assert between.carry(grey(2), frame=2)
     assert not between.carry(np.random.default_rng(0).integers(0, 256, grey(4).shape, np.uint8), frame=4)
@@ -74,3 +84,12 @@ def test_boxes_end_at_the_border_and_what_left_is_not_shown() -> None:
     labels, _ = carried_to(2, first=[outside, partly]).close([], frame=2)
     assert {label.track_id for label in labels} == {1}
     assert all(label.box_xyxy[0] >= 0 for label in labels)
+
+
+def test_boxes_are_cut_at_the_picture() -> None:
+    boxes = np.array([[-4, -3, 50, 60], [300, 200, 330, 230], [10, 10, 20, 20], [321, 0, 400, 9]], np.float32)
+    labels = [replace(seen(0, track_id=n), box_xyxy=box) for n, box in enumerate(boxes)]
+    cut = cut_at_border(labels, width=320, height=224)
+    assert [label.box_xyxy.tolist() for label in cut] == [[0, 0, 50, 60], [300, 200, 320, 224], [10, 10, 20, 20]]
+    assert cut[2] is labels[2] and cut_at_border([], width=320, height=224) == []
+    assert [label.track_id for label in cut_at_border(labels, width=320, height=224, least_inside=0.6)] == [0, 2]

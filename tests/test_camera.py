@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ego_fixtures import write_kitti
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -20,7 +21,6 @@ from labeling.camera import (
     resample,
     rigid,
     rotation_angle_deg,
-    write_kitti,
     write_tum,
 )
 from labeling.errors import TrajectoryError

@@ -178,3 +178,24 @@ def test_lines_that_are_no_key_and_text_are_refused(tmp_path, line):
     path.write_text(line, encoding="utf-8")
     with pytest.raises(DataError, match="row 1"):
         read_caption_table(path)
+
+
+def test_lists_in_lists_without_end_are_refused(tmp_path):
+    path = tmp_path / "c.jsonl"
+    path.write_text('{"key": "a_0", "text": ' + "[" * 100_000, encoding="utf-8")
+    with pytest.raises(DataError, match="cannot be read as a caption table"):
+        read_caption_table(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "character"),
+    [*((name, character) for name in KINDS[:3] for character in "\x1b\0\x9b"), ("captions.jsonl", "\ud800")],
+    ids=ascii,
+)
+def test_what_a_terminal_obeys_and_what_is_no_character_is_refused(tmp_path, name, character):
+    path = _write(tmp_path / name, [ROWS[0], {"key": "b_48", "text": f"A {character}[31mred car"}])
+    with pytest.raises(DataError, match="row 2 holds the control character .*; take it out"):
+        read_caption_table(path)
+    path = _write(tmp_path / name, [{"key": f"a{character}_0", "text": "A red car\twith\nlines"}])
+    with pytest.raises(DataError, match="row 1 holds the control character"):
+        read_caption_table(path)

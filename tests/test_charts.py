@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +11,23 @@ import numpy as np
 import pytest
 
 from labeling.errors import ConfigError, StorageError
+from pipelines import stability_ego
 from pipelines.charts import (
+    CHARTS,
     Chart,
     ChartPoint,
     Cost,
     Error,
     _named_tick,
+    draw_chart,
     interleaved_ms,
     pareto_front,
     run_chart,
     write_chart,
 )
 from pipelines.label_placing import crossing, place_labels
-from pipelines.stability import judged, make_table, run_stability, write_stability
+from pipelines.measure import show_stability
+from pipelines.stability import STABILITY, judged, make_table, run_stability, write_stability
 
 
 def point(method: str, ms: float, error: float, *, reference: bool = False) -> ChartPoint:
@@ -67,6 +72,20 @@ def test_a_picture_that_cannot_be_written_is_an_error_of_storage(tmp_path: Path)
     (tmp_path / "chart-ego.png").mkdir()
     with pytest.raises(StorageError, match=r"chart-ego\.png: is a directory"):
         write_chart(Chart(stage="ego", data="a street", points=POINTS, machine="a machine"), tmp_path)
+
+
+def test_each_group_has_a_front_of_its_own(tmp_path: Path) -> None:
+    """One point of another group changes nothing in the front of the first, and is on its own."""
+
+    def blue(points: tuple[ChartPoint, ...]) -> int:
+        """Pixels in the colour of points on a front."""
+        draw_chart(Chart(stage="a", data="", points=points, machine=""), tmp_path / "a.png")
+        picture = cv2.imread(str(tmp_path / "a.png"))
+        assert picture is not None
+        return int((np.abs(picture.astype(int) - (0xB0, 0x6C, 0x2B)).max(axis=2) < 4).sum())
+
+    beaten = point("other", 3, 8.0)
+    assert blue((*POINTS, replace(beaten, group="b"))) > 1.2 * blue((*POINTS, beaten))
 
 
 def test_another_cost_goes_by_its_own_name(tmp_path: Path) -> None:
@@ -156,6 +175,30 @@ def test_verdicts(limits: dict[str, Any], verdict: str) -> None:
 def test_tables_are_written(tmp_path: Path) -> None:
     write_stability(make_table("ego", "a street", [judged("night", 2.0, unit="m", at_most=3)]), tmp_path)
     assert json.loads((tmp_path / "stability-ego.json").read_text())["rows"][0]["verdict"] == "held"
+
+
+@pytest.mark.parametrize(("table", "called"), [(CHARTS, "chart"), (STABILITY, "stability")], ids=["chart", "stability"])
+def test_every_name_has_a_module_that_can_be_run(table: dict[str, str], called: str) -> None:
+    """Read and not imported: some of them load torch."""
+    for module in table.values():
+        spec = find_spec(module)
+        assert spec is not None and spec.origin is not None, module
+        assert f"\ndef {called}(" in Path(spec.origin).read_text(), module
+
+
+@pytest.mark.parametrize(
+    ("method", "code"), [("default", 1), ("stock OpenCV", 0)], ids=["our own fails", "a reference fails"]
+)
+def test_only_our_own_methods_fail_the_command(
+    method: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [judged("night", figure, unit="m", at_most=3, method=name) for name, figure in (("default", 2), (method, 4))]
+    table = make_table("ego", "a street", rows, references=("stock OpenCV",))
+    monkeypatch.setattr(stability_ego, "stability", lambda *, quick: table)
+    assert show_stability("ego", out=tmp_path) == code
+    assert "not held" in capsys.readouterr().out, "every row stays in the table"
+    written = json.loads((tmp_path / "stability-ego.json").read_text())
+    assert written["references"] == ["stock OpenCV"] and len(written["rows"]) == 2
 
 
 def test_unknown_names_list_the_known(tmp_path: Path) -> None:

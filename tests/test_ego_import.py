@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ego_fixtures import driven
+from ego_fixtures import driven, write_kitti
 from pipeline_fixtures import CLIP, run_all, small_config, write_street
 
 from dataset.loader import ShardDataset
 from dataset.receipts import read_receipts
 from dataset.tables import read_ego
-from labeling.camera import Trajectory, prior_intrinsics, write_kitti, write_tum
+from labeling.camera import Trajectory, prior_intrinsics, write_tum
 from labeling.ego_import import MISSING, FileClock, covered, motion_at, motion_modes, read_drive, trajectory_format
 from labeling.ego_motion import RoadView
 from labeling.errors import ConfigError, TrajectoryError

@@ -113,6 +113,35 @@ def test_traffic_on_most_corners_costs_confidence():
     assert np.median(swamped.confidence) < 0.4
 
 
+def with_objects(tracks, *, together):
+    """150 more corners, that all go to the right, or as fast but each its own way."""
+    rng = np.random.default_rng(5)
+    start = rng.uniform([100, 150], [540, 330], (150, 2))
+    ways = np.zeros(150) if together else rng.uniform(0, 2 * np.pi, 150)
+    per_frame = 4 * np.stack([np.cos(ways), np.sin(ways)], axis=1)
+    frames = []
+    for index, frame in enumerate(tracks.frames):
+        points = start + per_frame * index + rng.normal(0, 0.1, start.shape)
+        frames.append(
+            replace(
+                frame, ids=np.concatenate([frame.ids, 10**8 + np.arange(150)]),
+                points_px=np.concatenate([frame.points_px, points.astype(np.float32)]),
+                forward_backward_px=np.concatenate([frame.forward_backward_px, np.full(150, 0.1, np.float32)]),
+            )
+        )  # fmt: skip
+    return replace(tracks, frames=tuple(frames))
+
+
+def test_another_motion_that_many_corners_share_costs_confidence():
+    """As many corners that disagree with each other too cost less."""
+    street = tracks_of(driven(np.full(12, 8.0)))
+    together, scattered = (
+        np.median(solve_run(with_objects(street, together=one), intrinsics=camera()).confidence)
+        for one in (True, False)
+    )
+    assert together < 0.6 * scattered
+
+
 def test_traffic_before_a_standing_camera_moves_it_not():
     motion = solved(driven(np.zeros(FRAMES)), traffic=0.4)
     assert (motion.mode == "still").mean() >= 0.95

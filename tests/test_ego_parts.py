@@ -31,6 +31,13 @@ def test_forward_is_assumed_and_evidence_overrules_it():
     assert (travel_signs(-axes, np.zeros(8), turn_back_cost=12) == -1).all()
 
 
+@pytest.mark.parametrize(("evidence", "sign"), [(-0.25, 1), (-0.75, -1)], ids=["doubtful", "clear"])
+def test_a_run_is_backward_only_on_clear_evidence(evidence, sign):
+    """Eight steps that say so a little add up to less than the prior, eight that say so plainly to more."""
+    axes = np.tile([0.0, 0.0, -1.0], (8, 1))
+    assert (travel_signs(axes, np.full(8, evidence), turn_back_cost=12) == sign).all()
+
+
 def test_a_real_shake_is_kept_and_noise_is_not():
     rng = np.random.default_rng(0)
     slow = np.stack([np.sin(np.arange(120) / 20)] * 3, axis=1)

@@ -11,12 +11,29 @@ from scipy.spatial.transform import Rotation
 from labeling import ego_reference
 from labeling.camera import Intrinsics, Trajectory, prior_intrinsics, rebased_trajectory, rigid
 from labeling.ego_dust import NEAR_M, REACH_M, draw_specks, fill_cube, specks_in_view
-from labeling.ego_sphere import Lens, draw_sphere, sphere_coordinates, world_raster
+from labeling.ego_sphere import Lens, _texel, draw_sphere, world_raster
 from labeling.ego_video import ego_frames
 from labeling.errors import ConfigError, TrajectoryError
 
 WIDTH, HEIGHT = 264, 176
 CAMERA = prior_intrinsics(1056, 704)
+
+
+def _sphere_coordinates(cam_to_world: np.ndarray, x: np.ndarray, y: np.ndarray, *, lens: Lens) -> np.ndarray:
+    """Exact (azimuth + 180) / 360 and polar angle / 180 where pixels look, each in [0, 1].
+
+    Args:
+        cam_to_world: (4, 4) float64, relative to the first camera.
+        x: (N,) pixel columns.
+        y: (N,) pixel rows.
+        lens: the camera's.
+
+    Returns:
+        (N, 2) float64.
+    """
+    view, one = np.array([lens.fx, lens.fy, lens.cx, lens.cy]), np.ones(2)
+    motion = np.ascontiguousarray(cam_to_world, dtype=np.float64)
+    return np.array([_texel(a, b, motion, view, one) for a, b in zip(x, y, strict=True)]).reshape(-1, 2) + 0.5
 
 
 def _trajectory(*, forward_m=0.0, yaw_deg=0.0, pitch_deg=0.0, side_m=0.0, frames: int = 6) -> Trajectory:
@@ -85,8 +102,8 @@ def test_a_pure_turn_moves_sphere_and_dust_alike_without_parallax(yaw_deg, pitch
     assert len(before) > 50 and depth.max() > 4 * depth.min()
     assert np.abs(expected[:, :2] / expected[:, 2:] - after).max() < 1e-6
     inside = expected[:, :2] / expected[:, 2:]
-    here = sphere_coordinates(start, *before.T, lens=_lens(CAMERA))
-    there = sphere_coordinates(turned, *inside.T, lens=_lens(CAMERA))
+    here = _sphere_coordinates(start, *before.T, lens=_lens(CAMERA))
+    there = _sphere_coordinates(turned, *inside.T, lens=_lens(CAMERA))
     assert np.abs(here - there).max() < 1e-9, "and the sphere with it"
 
 
@@ -105,8 +122,8 @@ def test_a_translation_moves_near_dust_more_than_far_dust_and_hardly_the_sphere(
     before, after, depth = _followed(cube, start, _turned(0, position=step))
     moved = np.hypot(*(after - before).T)
     assert np.abs(moved - CAMERA.fx * step[0] / depth).max() < 1e-6, "sideways: f * step / depth, exactly"
-    here = sphere_coordinates(start, *before.T, lens=_lens(CAMERA))
-    there = sphere_coordinates(_turned(0, position=step), *before.T, lens=_lens(CAMERA))
+    here = _sphere_coordinates(start, *before.T, lens=_lens(CAMERA))
+    there = _sphere_coordinates(_turned(0, position=step), *before.T, lens=_lens(CAMERA))
     sphere_pixels = np.abs(here - there).max() * 2 * np.pi * CAMERA.fx
     assert sphere_pixels < 2 < moved.min() * 2
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from dataset.receipts import ReceiptLog, read_receipts
+from dataset.receipts import ReceiptLog, host_name, read_receipts
 from labeling.errors import ConfigError, VideoError
 from pipelines import stage as stage_module
 from pipelines.engine import Engine, minding_workers
@@ -236,3 +236,11 @@ def test_a_killed_worker_of_a_pool_is_an_error_that_advises() -> None:
         minding_workers(), ProcessPoolExecutor(1, mp_context=context) as pool,
     ):  # fmt: skip
         list(pool.map(signal.raise_signal, [signal.SIGKILL]))
+
+
+@pytest.mark.parametrize("process", ["abc", "", "1e3", "9" * 30, "²"], ids=ascii)
+def test_a_folder_that_no_worker_could_have_made_stays(tmp_path, process):
+    folder = tmp_path / ".staging" / f"x.{host_name()}-{process}"
+    folder.mkdir(parents=True)
+    sweep_staging(tmp_path)
+    assert folder.is_dir()

@@ -238,6 +238,12 @@ def test_a_sample_that_broke_off_does_not_cut_the_others_down() -> None:
     assert too_short([]) == {}
 
 
+def test_a_blink_is_too_short_though_all_samples_are() -> None:
+    blinks = [sample(f"a_0_{n}", times=TIMES[:4]) for n in range(3)]
+    assert too_short(blinks) == {one.name: "too short: 0.12 s, at least 0.20 s are needed" for one in blinks}
+    assert too_short([sample(times=TIMES[:6])]) == {}
+
+
 def test_boxes_are_those_that_were_given_and_low_objects_are_not_asked_for() -> None:
     labels = (car(0), car(0, left=120, track_id=2), car(0, left=180, side=2, track_id=3))
     clip = truth(labels=labels, box_tracks=frozenset({1, 3}))

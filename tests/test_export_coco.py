@@ -8,6 +8,7 @@ import pytest
 from pipeline_fixtures import HEIGHT, WIDTH, run_all, small_config, write_detector, write_street
 from skeleton_fixtures import busy_street, car, label
 
+from dataset.layout import run_path
 from dataset.receipts import atomic_write
 from dataset.tables import read_keypoints, write_keypoints
 from labeling.errors import ConfigError, DataError
@@ -15,7 +16,6 @@ from labeling.schemas import keypoint_schema
 from labeling.timeline import Span
 from pipelines.export_coco import COCO_IDS, CocoRun, coco_annotation, coco_category, coco_chunks, export_coco
 from pipelines.job import Job
-from pipelines.layout import run_path
 from pipelines.sources import find_videos
 
 

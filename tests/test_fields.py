@@ -177,6 +177,13 @@ def field_card(**changes: object) -> CifcafCard:
     return CifcafCard.model_validate(values)
 
 
+def test_a_card_has_one_head_of_a_category() -> None:
+    """A track that met two schemas would have points of two kinds."""
+    heads = [{"schema": name, "cif": f"{name}_cif", "caf": f"{name}_caf"} for name in ("car24", "car66")]
+    with pytest.raises(ValueError, match="two heads give the same category.*leave one of them out"):
+        field_card(heads=heads)
+
+
 def test_one_network_serves_cars_and_lanes(tmp_path: Path) -> None:
     card = field_card()
     cars = plant(

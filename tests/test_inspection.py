@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from skeleton_fixtures import car
 
-from dataset.inspection import clip_verdict, contact_sheet, find_sample, moment_frames, spread, summarize
+from dataset.contact_sheet import TILE, contact_sheet, moment_frames, thickened
+from dataset.inspection import clip_verdict, find_sample, spread, summarize
 from dataset.loader import ShardDataset
 from dataset.receipts import Output, Receipt, ReceiptLog
 from dataset.selection import ClipRow, Selection, write_selection
@@ -98,12 +99,35 @@ def test_moments_are_spread_from_the_first_frame_to_the_last(job):
 
 def test_a_sheet_has_a_row_for_each_video_that_is_there(job):
     sheet = contact_sheet(ShardDataset(job)[0])
-    assert sheet.dtype == np.uint8
-    # Columns of the last tile, where all pictures are of one grey each.
-    column = sheet[:, 92 + 7 * 270 + 132].astype(int)
+    assert sheet.dtype == np.uint8 and sheet.shape[1] > 4 * TILE[0]
+    # A column of the last tiles, where all pictures are of one grey each.
+    column = sheet[:, -TILE[0] // 2].astype(int)
     grey = np.flatnonzero((np.abs(column - 160) <= 2).all(axis=1))
     runs = np.split(grey, np.flatnonzero(np.diff(grey) > 1) + 1)
-    assert [len(run) for run in runs] == [176, 176, 176]
+    assert [len(run) for run in runs] == [TILE[1]] * 3
+
+
+def test_a_black_tile_says_that_nothing_was_to_be_drawn(job):
+    sample = ShardDataset(job)[0]
+    sheet = contact_sheet(sample)
+    levels = [int(frame.max()) for _, frame in moment_frames(sample, "objects.mp4", 4)]
+    assert levels[0] < 40 < levels[1]
+    row = sheet[-TILE[1] - 12 : -12, -4 * (TILE[0] + 6) - 6 : -6]
+    tiles = row.reshape(TILE[1], 4, TILE[0] + 6, 3)[:, :, : TILE[0]]
+    spread = np.ptp(tiles.max(axis=3), axis=(0, 2))
+    assert spread[0] > 100 and (spread[1:] < 10).all(), "words on the first tile alone"
+
+
+@pytest.mark.parametrize("radius", [0, 1, 2])
+def test_thickened_lines_grow_evenly_and_mix_no_colours(radius):
+    frame = np.zeros((40, 60, 3), np.uint8)
+    frame[20, 5:30], frame[20, 30:55] = (255, 80, 0), (0, 90, 255)
+    wide = thickened(frame, radius)
+    lit = wide.max(axis=2) > 0
+    assert lit[20 - radius : 21 + radius, 5 - radius : 55 + radius].all()
+    assert lit.sum() == (2 * radius + 1) * (50 + 2 * radius)
+    assert set(map(tuple, wide[lit])) == {(255, 80, 0), (0, 90, 255)}
+    assert np.array_equal(wide[frame.max(axis=2) > 0], frame[frame.max(axis=2) > 0]), "what is drawn keeps its place"
 
 
 def test_a_spread_of_nothing_is_none():
@@ -116,7 +140,7 @@ def test_a_sheet_says_when_the_object_row_shows_a_few_of_many(job, monkeypatch):
     sample = ShardDataset(job)[0]
     plain = contact_sheet(sample)
     for count, same in ((5, True), (6, False)):
-        monkeypatch.setattr("dataset.inspection.tracks_of", lambda _, count=count: set(range(count)))
+        monkeypatch.setattr("dataset.contact_sheet.tracks_of", lambda _, count=count: set(range(count)))
         assert np.array_equal(contact_sheet(sample), plain) == same
 
 

@@ -11,7 +11,7 @@ from dataset.receipts import ReceiptLog, read_receipts
 from dataset.selection import read_selection
 from labeling.errors import ConfigError
 from pipelines.commands import JobOptions, prepare_job, run_select
-from pipelines.config import merged
+from pipelines.config import EFFORTS, Config, merged, with_effort
 from pipelines.given_tables import read_leave_out
 from pipelines.job import Job, open_job
 from pipelines.sources import Source, find_videos
@@ -39,6 +39,14 @@ def ranked_job(root, videos, detector):
     sources = {path.stem: Source(video_id=path.stem, path=path) for path in sorted(videos.glob("*.mp4"))}
     config = small_config(select={"keep_share": 0.3}, keypoints={"extractors": []}, count={"detector": "counter"})
     return Job(root, config, sources, models_dir=detector)
+
+
+def test_a_greater_effort_looks_more_often_in_counting_and_keypoints():
+    efforts = [with_effort(Config(), effort) for effort in EFFORTS]
+    fast, balanced, exact = (config.count.looks_per_clip for config in efforts)
+    assert 1 <= fast < balanced < exact
+    assert [config.keypoints.effort for config in efforts] == list(EFFORTS)
+    assert with_effort(Config(), "balanced") == Config()
 
 
 @pytest.mark.parametrize("before", ["another rule", "no selection"])

@@ -8,8 +8,9 @@ import pytest
 from dataset.street_labels import StreetObject
 from labeling.labels import POINT_DETECTED, Keypoints
 from labeling.schemas import Category
+from pipelines.demo import CarComparison
 from pipelines.keypoint_clips import street_frames
-from pipelines.keypoint_errors import lane_score, longest_phantom, match_frames, phantom_frames, point_score, recall
+from pipelines.keypoint_errors import lane_score, match_frames, phantom_frames, point_score, recall, track_spans
 from pipelines.track_errors import PointSeries, jitter_px, lag_frames, point_series, track_score
 
 GRID = np.stack(np.meshgrid(np.linspace(5, 75, 6), np.linspace(5, 55, 4)), axis=-1).reshape(-1, 2)
@@ -49,6 +50,15 @@ def test_points_of_missed_objects_are_wrong() -> None:
     assert np.isnan(point_score([frame], category="person").pck)
 
 
+def test_the_demo_lets_no_two_cars_share_a_label() -> None:
+    cars = CarComparison()
+    cars.add([label(0, 0, 100)], [thing(1, 100), thing(2, 110)], frame=0)
+    assert (cars.found, cars.right) == ([True, False], [True]), "one car of two, though both overlap it"
+    cars.add([label(5, 0, 100, off=2), label(5, 1, 110, score=0.8)], [thing(1, 100), thing(2, 900, share=0.1)], frame=5)
+    assert (cars.found[2:], cars.right[1:]) == ([True], [True, False]), "a second label of one car is wrong"
+    assert np.median(np.concatenate(cars.errors_px)) == pytest.approx(1.0)
+
+
 def test_recall_by_height() -> None:
     truth = [[thing(1, 100, height=60), thing(2, 500, height=20), thing(3, 700, height=20, share=0.1)]]
     matched = match_frames([label(0, 0, 100)], truth)
@@ -62,7 +72,7 @@ def test_phantoms_match_nothing_and_lie_on_nothing() -> None:
     matched = match_frames(found, truth)
     assert [[p.track_id for p in frame.phantoms] for frame in matched] == [[2], [2], []]
     assert phantom_frames(matched) == pytest.approx(2 / 3)
-    assert longest_phantom(matched) == 2
+    assert track_spans(label for frame in matched for label in frame.phantoms) == {2: 2}
 
 
 def test_lanes_by_hand() -> None:

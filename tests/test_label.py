@@ -1,6 +1,8 @@
 """The main job on small videos: what is made, what is redone, and what a bad video does to the others."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -8,19 +10,22 @@ import pytest
 from pipeline_fixtures import CLIP, HEIGHT, WIDTH, run_all, small_config, tree, write_detector, write_street
 from video_fixtures import cut_off, write_audio_only
 
-from dataset.inspection import contact_sheet, summarize
+from dataset.contact_sheet import TILE, contact_sheet
+from dataset.inspection import summarize
 from dataset.loader import ShardDataset
-from dataset.receipts import read_receipts
+from dataset.receipts import ReceiptLog, read_receipts
 from dataset.selection import read_selection
 from dataset.tables import read_keypoints
 from labeling.camera import check_poses
-from labeling.errors import ConfigError
+from labeling.errors import ConfigError, StorageError
 from labeling.model_cards import load_cards, write_card
 from labeling.timeline import clip_key
 from pipelines.job import Job, open_job, open_or_create
 from pipelines.label import sweep_outdated
+from pipelines.nothing_left import why_nothing_is_left
 from pipelines.sources import Source, find_videos
 from pipelines.stage import NotReadyError, Part, parse_part
+from pipelines.stages_source import CutStage
 
 KEEP_ALL = {"select": {"keep_share": 1.0}}
 
@@ -96,6 +101,30 @@ def test_a_finished_job_has_nothing_left_to_do(counted):
     made, reports = run_all(open_job(counted.root))
     assert made == []
     assert not [r for report in reports for r in report.failed]
+
+
+def test_where_items_failed_that_is_why_nothing_is_packed(tmp_path, counted):
+    """What the selection dropped is no reason while other clips were kept; want of storage is told before all else."""
+    root = tmp_path / "J"
+    shutil.copytree(counted.root, root)
+    assert "no clip is left of" in why_nothing_is_left(root)
+    first, second, *_ = read_receipts(root, "pack").values()
+    for held, reason, message in ((first, "data", "is broken"), (second, "storage", "no space left on device")):
+        failed = replace(held, state="failed", reason=reason, message=message, turn=held.turn + 1, outputs=())
+        ReceiptLog(root, "pack").append(failed)
+    told = f"no clip is packed: pack of {second.item} failed: no space left on device (2 items failed in all)"
+    assert why_nothing_is_left(root) == told
+
+
+def test_a_stage_that_could_write_nothing_ends_the_command(tmp_path, short_video, monkeypatch):
+    def full(*_):
+        raise StorageError("run.mp4: file too large; raise the file-size limit")
+
+    monkeypatch.setattr(CutStage, "work", full)
+    job = Job(tmp_path / "J", small_config(**KEEP_ALL), {"short": short_video})
+    with pytest.raises(StorageError, match=r"file-size limit \(cut could write nothing\)"):
+        run_all(job)
+    assert not read_receipts(job.root, "pack")
 
 
 def test_worker_processes_make_the_same_bytes(tmp_path, videos, detector, counted):
@@ -304,10 +333,11 @@ def test_without_a_detector_clips_cannot_be_ranked(tmp_path, videos, monkeypatch
 def test_the_sheet_of_a_packed_clip_shows_its_four_videos(counted):
     sample = ShardDataset(counted.root)[0]
     sheet = contact_sheet(sample)
-    assert sheet.dtype == np.uint8 and sheet.shape[1] > 8 * 264 and sheet.shape[0] > 4 * 176
-    rgb = cv2.resize(sample.frames("rgb.mp4")[0], (264, 176), interpolation=cv2.INTER_NEAREST)
-    tiles = sheet[-4 * 182 - 6 : -4 * 182 - 6 + 176, 92 : 92 + 264]
-    assert np.array_equal(tiles, rgb)
+    width, height = TILE
+    assert sheet.dtype == np.uint8 and sheet.shape[1] > 4 * width and sheet.shape[0] > 4 * height
+    rgb = cv2.resize(sample.frames("rgb.mp4")[0], TILE, interpolation=cv2.INTER_NEAREST)
+    top, left = sheet.shape[0] - 4 * (height + 6) - 6, sheet.shape[1] - 4 * (width + 6) - 6
+    assert np.array_equal(sheet[top : top + height, left : left + width], rgb)
 
 
 def test_parts_are_read_strictly():

@@ -43,6 +43,7 @@ def test_height_does_not_count_in_the_ground_plane() -> None:
     raised = straight(10)
     raised[:, 1, 3] -= 7
     assert ade_m(raised, straight(10), alignment="none") == 0
+    assert apd_m([raised, straight(10)]) == 0
 
 
 def test_min_ade_takes_the_best_sample() -> None:

@@ -140,6 +140,21 @@ def test_a_broken_contract_is_an_error_before_any_comparison(tmp_path: Path) -> 
         check_card(toy_card(), path, [BLUE.astype(np.float32)])
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf], ids=str)
+@pytest.mark.parametrize("images", [[], [BLUE]], ids=["noise", "picture"])
+def test_a_network_that_gives_no_numbers_fails(tmp_path: Path, bad: float, images: list[np.ndarray]) -> None:
+    card = toy_card()
+    path = onnx_fixtures.constant_model(tmp_path / "toy.onnx", card, {"output": np.full((84, 6), bad)})
+    check = check_card(card, path, images)
+    assert check.verdict == "fails" and "as its card says (BGR, 0 to 255), toy gave NaN or infinity" in check.advice
+
+
+def test_a_network_that_gives_one_row_for_two_pictures_fails(tmp_path: Path) -> None:
+    card = toy_card()
+    check = check_card(card, onnx_fixtures.deaf_model(tmp_path / "toy.onnx", card, np.zeros((84, 6))), [BLUE])
+    assert check.verdict == "fails" and "two pictures at once, toy gave [1, 84, 6]" in check.advice
+
+
 def check_real(real_data: Path, **changes: object) -> CardCheck:
     capture = cv2.VideoCapture(str(real_data / "solidWhiteRight.mp4"))
     frames = [capture.read()[1][:, :, ::-1] for _ in range(61)]

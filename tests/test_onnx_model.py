@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from labeling.errors import ModelError
 from labeling.model_cards import (
     CifcafCard,
+    FieldHeadCard,
     YoloxCard,
     file_sha256,
     find_weights,
@@ -69,6 +70,17 @@ class TestCards:
             ('sha256 = "beef"', "sha256"),
             ('file = "../head.onnx"', "file"),
             ("input_width = -1", "input_width"),
+            ("input_width = 640000000000", "input_width"),
+            ("std = [1.0, nan, 1.0]", "std"),
+            ("std = [1.0, inf, 1.0]", "std"),
+            ("std = [1.0, 1e-320, 1.0]", "std must be 0.001 to"),
+            ("mean = [nan, 0.0, 0.0]", "mean"),
+            ("mean = [0.0, 0.0, -1e300]", "mean must be at most"),
+            ("simcc_split = inf", "simcc_split"),
+            ("simcc_split = 1e308", "simcc_split"),
+            ("crop_padding = inf", "crop_padding"),
+            pytest.param("input_width = 1" + "0" * 5000, "TOML", id="a number of 5001 digits"),
+            pytest.param("notes = " + "[" * 5000, "TOML", id="lists in lists"),
             ("input_width", "TOML"),
         ],
     )
@@ -92,6 +104,18 @@ class TestCards:
         with pytest.raises(ValidationError, match="same output"):
             heads = [{"schema": "car24"}, {"schema": "lane24"}]
             CifcafCard.model_validate({**fields, "input_height": 705, "heads": heads})
+
+    def test_no_threshold_is_infinite_or_none(self) -> None:
+        values = {
+            "name": "d", "file": "d.onnx", "input_width": 64, "input_height": 64, "licence": "-", "source": "-",
+            "classes": ("car",), "categories": {},
+        }  # fmt: skip
+        nan = float("nan")
+        for wrong in ({"soft_nms": {"sigma": np.inf}}, {"score_threshold": nan}, {"score_thresholds": {"car": nan}}):
+            with pytest.raises(ValidationError, match="finite"):
+                YoloxCard.model_validate({**values, **wrong})
+        with pytest.raises(ValidationError, match="point_threshold\n.*finite"):
+            FieldHeadCard.model_validate({"schema": "car24", "point_threshold": nan})
 
     def test_cards_of_a_users_folder_join_and_must_not_clash(self, tmp_path: Path) -> None:
         write_card(simcc_card(name="mine"), tmp_path / "mine.toml")
@@ -184,6 +208,16 @@ class TestSessions:
         )
         with pytest.raises(ModelError, match=r"\[N, 3, 96, 64\]"):
             OnnxModel(simcc_card(), path)
+
+    def test_one_row_for_many_inputs_stops(self, tmp_path: Path) -> None:
+        card = YoloxCard(
+            name="d", file="d.onnx", input_width=64, input_height=64, licence="-", source="-", classes=("car",),
+            categories={},
+        )  # fmt: skip
+        model = OnnxModel(card, onnx_fixtures.deaf_model(tmp_path / "d.onnx", card, np.zeros((84, 6))))
+        assert model.run(np.zeros((1, 3, 64, 64), np.float32))[0].shape == (1, 84, 6)
+        with pytest.raises(ModelError, match=r"\[1, 84, 6\] in 'output' for a batch of 5, not \[5, 84, 6\]"):
+            model.run(np.zeros((5, 3, 64, 64), np.float32))
 
     @pytest.mark.parametrize("value", [np.nan, np.inf], ids=str)
     def test_numbers_that_are_none_stop(self, tmp_path: Path, value: float) -> None:
@@ -287,6 +321,14 @@ class TestExternalData:
         (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
         with pytest.raises(ModelError, match="outside the model's folder; refused"):
             check_external_data(external_model(folder, location, nested=nested))
+
+    @pytest.mark.parametrize("location", ["a\0b", "a" * 400, "circle"], ids=["NUL", "long", "circle"])
+    def test_what_names_no_file_is_refused(self, tmp_path: Path, location: str) -> None:
+        (tmp_path / "circle").symlink_to(tmp_path / "circle")
+        path = external_model(tmp_path, location)
+        with pytest.raises(ModelError, match="'weight' is stored in .*; (export|copy)"):
+            check_external_data(path)
+        assert weights_sha256(path) == hashlib.sha256(path.read_bytes()).hexdigest()
 
     @pytest.mark.parametrize(
         "offset, length, complaint",

@@ -79,6 +79,36 @@ def test_a_whole_line_that_is_no_receipt_is_an_error(tmp_path):
         read_receipts(tmp_path, "cut")
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "told"),
+    [
+        ("facts", None, "facts is None"),
+        ("facts", [1], r"facts is \[1\]"),
+        ("state", "well", "state is 'well'"),
+        ("turn", "1", "turn is '1'"),
+        ("item", 7, "item is 7"),
+        ("outputs", [{"path": 5, "size": 1, "sha256": ""}], "path is 5"),
+        ("outputs", [{"path": "a", "size": None, "sha256": ""}], "size is None"),
+        ("outputs", 3, "not iterable"),
+    ],
+)
+def test_a_record_of_other_types_is_no_receipt(tmp_path, field, value, told):
+    ReceiptLog(tmp_path, "cut", worker="w").append(receipt("a"))
+    path = tmp_path / "receipts" / "cut" / "w.jsonl"
+    path.write_text(json.dumps({**json.loads(path.read_text()), field: value}) + "\n")
+    with pytest.raises(DataError, match=f"w.jsonl:1: is no receipt .*{told}.*; move the line away"):
+        read_receipts(tmp_path, "cut")
+
+
+@pytest.mark.parametrize("line", [b"[" * 99_999, b"[]", b"3", b"null", b'{"outputs": 0}'], ids=lambda line: line[:9])
+def test_a_line_that_is_no_record_is_no_receipt(tmp_path, line):
+    path = tmp_path / "receipts" / "cut" / "w.jsonl"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(line + b"\n")
+    with pytest.raises(DataError, match="is no receipt"):
+        read_receipts(tmp_path, "cut")
+
+
 def test_a_line_that_does_not_fit_is_taken_back(tmp_path, monkeypatch):
     log = ReceiptLog(tmp_path, "cut", worker="w")
     log.append(receipt("a"))

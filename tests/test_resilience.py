@@ -9,6 +9,7 @@ import json
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -17,13 +18,14 @@ import pytest
 from pipeline_fixtures import SilentReporter, run_all, small_config, tree, write_detector, write_street
 
 from dataset import receipts
-from dataset.receipts import ReceiptLog, read_receipts
+from dataset.receipts import AlteredError, ReceiptLog, read_receipts, sha256_file
 from labeling.errors import StorageError
 from pipelines import engine, items
+from pipelines.items import files_read
 from pipelines.job import Job
 from pipelines.label import StageReport, run_stages
 from pipelines.sources import find_videos
-from pipelines.stage import STAGES, NotReadyError
+from pipelines.stage import STAGES
 
 MOMENTS = ("outputs made, none published", "outputs published, no receipt", "receipt torn")
 
@@ -132,7 +134,7 @@ def run_with_small_files(job: Job, limit: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     try:
         _, reports = run_all(job)
-    except (StorageError, NotReadyError):
+    except StorageError:
         os._exit(3)
     failures = [receipt for report in reports for receipt in report.failed]
     os._exit(3 if failures and all(f.reason == "storage" and f.retryable for f in failures) else 4)
@@ -186,3 +188,64 @@ def test_a_worker_that_dies_does_not_take_the_job_along(
         reports = run_stages(job, tuple(STAGES), pool, reporter)
     assert [receipt.message for report in reports for receipt in report.failed] == []
     assert tree(job.root) == tree(undisturbed.root)
+
+
+@pytest.mark.parametrize(
+    "stage", ["count", "cut", "keypoints", "corners", "camera", "ego", "skeleton", "render", "shards"]
+)
+def test_it_is_known_what_an_item_reads(undisturbed: Job, stage: str) -> None:
+    for item in undisturbed.plan(stage):
+        read = files_read(item)
+        assert read, f"{item.name} reads nothing"
+        assert {path: sha256_file(undisturbed.root / path) for path in read} == read
+
+
+def alter(path: Path) -> None:
+    """Other bytes in the middle of a file, which keeps its size."""
+    data = bytearray(path.read_bytes())
+    middle = slice(len(data) // 2, len(data) // 2 + 20)
+    data[middle] = bytes(byte ^ 0x55 for byte in data[middle])
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("altered", "gone", "stage"),
+    [
+        ("videos/day/index.parquet", "videos/day/run_*[0-9].mp4", "cut"),
+        ("videos/day/run_*[0-9].mp4", "shards/*.tar", "pack"),
+        ("shards/rows/*.parquet", "shards/index.parquet", "shards"),
+    ],
+)
+def test_what_is_made_from_an_altered_file_fails_until_that_file_is_removed(
+    tmp_path: Path, videos: Path, detector: Path, undisturbed: Job, altered: str, gone: str, stage: str
+) -> None:
+    """A bad disk, or a person, changes what an item reads and not its size: the receipt's sha256 tells."""
+    root = tmp_path / "J"
+    shutil.copytree(undisturbed.root, root)
+    damaged = min(root.glob(altered))
+    alter(damaged)
+    for path in root.glob(gone):
+        path.unlink()
+    _, reports = run_all(make_job(root, videos, detector), stages=tuple(STAGES)[: tuple(STAGES).index(stage) + 1])
+    assert [receipt for report in reports[:-1] for receipt in report.failed] == []
+    assert reports[-1].failed
+    for receipt in reports[-1].failed:
+        assert (receipt.reason, receipt.retryable) == ("altered", True)
+        assert str(damaged) in receipt.message and "remove it and run again" in receipt.message
+    damaged.unlink()
+    run_all(make_job(root, videos, detector))
+    assert tree(root) == tree(undisturbed.root)
+
+
+@pytest.mark.parametrize("table", ["selection.parquet", "shards/index.parquet"])
+def test_an_altered_table_of_the_whole_job_stops_it_until_it_is_removed(
+    tmp_path: Path, videos: Path, detector: Path, undisturbed: Job, table: str
+) -> None:
+    root = tmp_path / "J"
+    shutil.copytree(undisturbed.root, root)
+    alter(root / table)
+    with pytest.raises(AlteredError, match=f"{table}: was altered or damaged .*; remove it and run again"):
+        run_all(make_job(root, videos, detector))
+    (root / table).unlink()
+    run_all(make_job(root, videos, detector))
+    assert tree(root) == tree(undisturbed.root)

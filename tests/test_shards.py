@@ -1,4 +1,5 @@
 import tarfile
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -16,6 +17,7 @@ from dataset.shards import (
     write_shard,
     write_shard_index,
 )
+from dataset.tables import SHARD_INDEX_SCHEMA, table_of, write_table
 from labeling.errors import ConfigError, DataError
 from labeling.timeline import LONGEST_VIDEO_ID, clip_key
 
@@ -117,12 +119,28 @@ def test_a_broken_shard_is_found_out(tmp_path):
     path.write_bytes(data)
     with pytest.raises(DataError, match=r"a_48\.rgb\.mp4 is not as it was written"):
         check_shard(path, rows)
+    with pytest.raises(DataError, match=r"a_48\.rgb\.mp4 is not as it was packed .*; copy it again, or remove it"):
+        read_member(tmp_path, rows[2])
+    assert read_member(tmp_path, rows[1]) == b"a_0"
     path.write_bytes(data[: rows[2].offset + 10])
     with pytest.raises(DataError, match=r"ends inside a_48\.rgb\.mp4"):
         read_member(tmp_path, rows[2])
     path.unlink()
     with pytest.raises(DataError, match="cannot be read"):
         read_member(tmp_path, rows[2])
+
+
+@pytest.mark.parametrize(("offset", "size"), [(0, 1 << 62), (1 << 40, 5)])
+def test_a_damaged_index_makes_no_buffer_of_what_it_claims(tmp_path, offset, size):
+    row = replace(write(tmp_path / "train-000000.tar")[0], offset=offset, size=size)
+    with pytest.raises(DataError, match=r"ends inside a_0\.rgb\.mp4"):
+        read_member(tmp_path, row)
+
+
+def test_an_index_with_empty_fields_is_refused(tmp_path):
+    write_table(tmp_path / "index.parquet", table_of(SHARD_INDEX_SCHEMA, [{"key": "a_0"}]))
+    with pytest.raises(DataError, match="rows with empty fields; remove it"):
+        read_shard_index(tmp_path / "index.parquet")
 
 
 def test_stock_webdataset_reads_the_samples(tmp_path):

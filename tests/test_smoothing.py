@@ -51,6 +51,16 @@ def test_moving_points_do_not_lag(motion: str) -> None:
     assert np.abs(smooth - truth).mean() < np.abs(noisy[..., :2] - truth).mean()
 
 
+def test_a_foot_that_swings_while_the_body_stands_is_followed() -> None:
+    truth, noisy = series(np.full((96, 2), 300.0), noise=0.5)
+    swing = 30 * np.sin(2 * np.pi * np.arange(96) / 18)
+    truth[:, 0, 0] += swing
+    noisy[:, 0, 0] += swing
+    errors = (smooth_series(noisy, SETTINGS) - truth)[12:-12]
+    assert np.abs(errors[:, 0]).max() < 3
+    assert errors[:, 1:].std() < 0.5 * (noisy[..., :2] - truth).std(), "the body is as steady as if nothing swung"
+
+
 def test_even_motion_passes_unchanged() -> None:
     t = np.arange(60)[:, None]
     truth, noisy = series(np.concatenate([3 * t + 0.1 * t**2, 200 - 2 * t], axis=1), noise=0)

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import cv2
+import matplotlib
 import numpy as np
 import pytest
 
@@ -16,7 +17,7 @@ from pipelines.keypoint_errors import MatchedFrame
 from pipelines.keypoint_harm import Board, behind_board, board_targets, frozen, in_condition, spliced
 from pipelines.reliability import reliability_curve, share_right
 from pipelines.scored_points import scored_points
-from pipelines.stability import judged, make_table, run_stability, write_stability
+from pipelines.stability import judged, make_table, read_stability, run_stability, write_stability
 from pipelines.stability_keypoints import (
     column_passages,
     drift_shares,
@@ -110,11 +111,11 @@ def test_scored_points_know_right_from_wrong():
         [frame_of((thing, label), (small, found(small)), (thing, None), phantoms=(found(car(), score=0.6),))]
     )
     assert len(rows) == 23 + 24, "absent points and objects that are not judged do not count"
-    assert rows[:23, 1].sum() == 17 and not rows[23:, 1].any()
+    assert rows[:23, 1].sum() == 17 and not rows[23:, 1].any() and not rows[:, 2].any()
     # A point that is hidden is right where the car's own point lies.
     hidden = replace(thing, visible=np.zeros(24, bool))
-    assert scored_points([frame_of((hidden, found(thing)))])[:, 1].all()
-    assert scored_points([]).shape == (0, 2)
+    assert scored_points([frame_of((hidden, found(thing)))])[:, 1:].all()
+    assert scored_points([]).shape == (0, 3)
 
 
 def test_bins_hold_their_scores():
@@ -125,6 +126,15 @@ def test_bins_hold_their_scores():
     assert sum(one.points for one in curve.bins) == len(points)
     assert share_right(points, low=0.85, high=0.95) == (pytest.approx(2 / 3), 3)
     assert share_right(points, low=0.85)[1] == 5 and share_right(points[:0], low=0.5)[1] == 0
+
+
+def test_hidden_points_have_a_curve_of_their_own():
+    points = np.array([[0.05, 1, 1], [0.05, 1, 1], [0.05, 0, 0], [0.95, 1, 0], [0.95, 0, 1]])
+    every, seen, hidden = (reliability_curve("made", points, kind=kind) for kind in ("all", "in view", "hidden"))
+    assert (hidden.bins[0].points, hidden.bins[0].share) == (2, 1.0)
+    assert (seen.bins[0].points, seen.bins[0].share) == (1, 0.0)
+    for both, one, other in zip(every.bins, seen.bins, hidden.bins, strict=True):
+        assert (both.points, both.right) == (one.points + other.points, one.right + other.right)
 
 
 def test_a_spliced_clip_has_its_cut_found():
@@ -176,7 +186,10 @@ def test_conditions_keep_the_truth_and_change_the_pictures():
 def test_curves_are_written_beside_the_table(tmp_path):
     curve = reliability_curve("made", np.array([[0.9, 1.0], [0.2, 0.0]]))
     table = replace(make_table("keypoints", "made", [judged("x", 1.0, unit="%", at_most=2)]), curves=(curve, curve))
+    settings = dict(matplotlib.rcParams)
     write_stability(table, tmp_path)
+    assert dict(matplotlib.rcParams) == settings
+    assert read_stability(tmp_path / "stability-keypoints.json") == table
     values = json.loads((tmp_path / "stability-keypoints.json").read_text())
     assert values["curves"][0]["bins"][9] == {"low": 0.9, "high": 1.0, "points": 1, "right": 1}
     picture = cv2.imread(str(tmp_path / "reliability-keypoints.png"))
@@ -190,4 +203,6 @@ def test_the_table_plays_two_conditions_quickly(tmp_path):
     scenarios = {row.scenario for row in table.rows}
     assert {"undisturbed", "dusk, gain 0.4", "night, gain 0.15"} <= scenarios
     assert all(row.figure is not None and np.isfinite(row.figure) for row in table.rows)
-    assert [curve.name for curve in table.curves] == ["undisturbed", "in every condition"]
+    assert [(curve.name, curve.kind) for curve in table.curves] == [
+        (name, kind) for name in ("undisturbed", "in every condition") for kind in ("in view", "hidden")
+    ]

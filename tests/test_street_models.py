@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from dataset.street import Street
-from labeling.detection import decode_yolox
+from labeling.detection import decode_yolox, grid_cells
 from labeling.errors import ModelError
 from labeling.fields import FieldDecoder
 from labeling.keypoints import decode_simcc
@@ -31,7 +31,7 @@ from training.street_plans import judging_frames, plan_streets
 from training.street_pool import PICTURE_SIZE, ObjectTruth, PoolCrop, PoolFrame, RenderPlan, StreetPool, render_pool
 from training.street_recipes import MODEL_NAMES, recipe
 from training.street_scores import distance_to_curve
-from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses, grid_cells
+from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses
 
 WIDTH, HEIGHT = 256, 192
 FLOORS = {"car_recall": 0.85, "car_pck10": 0.8, "lane_recall": 0.8}
@@ -552,7 +552,6 @@ def test_streets_rendered_side_by_side_are_the_same_and_in_order() -> None:
         assert all(np.array_equal(a.box_xyxy, b.box_xyxy) for a, b in zip(truths, same, strict=True))
 
 
-@pytest.mark.slow
 def test_what_ships_is_accurate_on_streets_it_never_saw() -> None:
     figures = evaluate(SHIPPED_CARDS, streets=6, frames=3)
     short = {name: figures[name] for name, floor in FLOORS.items() if figures[name] < floor}

@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 import torch
 
-from labeling.detection import decode_yolox, letterbox
+from labeling.detection import decode_yolox, grid_cells, letterbox
 from labeling.model_cards import YoloxCard
 from labeling.schemas import Category
 from pipelines.model_variants import resized_detector
@@ -31,7 +31,7 @@ from training.street_second_look import (
     best_candidates,
     sample_boxes,
 )
-from training.street_targets import encode_boxes, grid_cells
+from training.street_targets import encode_boxes
 
 WIDTH, HEIGHT = 256, 192
 CARD = YoloxCard(

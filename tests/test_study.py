@@ -3,20 +3,25 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from dataset.street import Street, StreetConfig
 from dataset.street_segments import SEGMENTS
+from labeling.boxes import iou
 from labeling.camera import Trajectory, rigid
 from labeling.errors import ConfigError, DataError
+from pipelines.study_picture import BESIDES, FIGURES, draw_study, shared_reason
+from training.criteria import MATCH_IOU
 from training.metrics import mean_interval
 from training.study_judge import PAIR_FRAMES, JudgeClip, chained, motion_of, pair_batch
 from training.study_plan import ARMS, QUESTIONS, plan_study
 from training.study_scores import CAP_PX, Reading, TrueTrack, clip_scores, track_scores, true_tracks
 from training.study_shapes import shape_video
-from training.study_verdicts import Gate, find, judge_gate, paired_interval, table_of
+from training.study_verdicts import Gate, crossed_interval, find, judge_gate, table_of
 
 HOLDS = Gate(figure="keypoint_error", holds=True, reason="")
 
@@ -86,6 +91,15 @@ def test_one_box_serves_one_car():
     assert scores["recall"] == 0.5
 
 
+def test_overlaps_too_small_to_match_keep_no_true_pair_from_being_made():
+    # IoU of the first car with the boxes 0.43 and 0.25, of the second 0.25 and 0: 0.25 twice is more than 0.43 once.
+    tracks = [_still_track(box=(0, 0, 100, 10)), _still_track(box=(100, 0, 200, 10))]
+    boxes = np.array([[40, 0, 140, 10], [-60, 0, 40, 10]], float)
+    first, second = (iou(track.boxes_xyxy[:1], boxes)[0] for track in tracks)
+    assert first[0] >= MATCH_IOU > max(first[1], second[0]) and first[1] + second[0] > first[0] + second[1]
+    assert track_scores([boxes] * 4, tracks)["recall"] == 0.5
+
+
 def test_tracks_begin_in_the_first_frame_and_end_where_the_truth_shows_them_badly():
     box = np.array([0, 0, 20, 20], float)
     frames = [{1: (box, True), 2: (box, False)}, {1: (box, True), 3: (box, True)}, {1: (box, False)}, {1: (box, True)}]
@@ -127,7 +141,7 @@ def test_pairs_that_are_mirrored_or_reversed_keep_their_truth():
 
 def test_an_interval_of_one_seed_agrees_with_the_bootstrap_over_streets():
     values = np.random.default_rng(1).normal(size=24)
-    mine = paired_interval(values[None])
+    mine = crossed_interval(values[None])
     peer = mean_interval(list(values), [str(street) for street in range(24)])
     assert (mine.low, mine.high) == pytest.approx((peer.low, peer.high), abs=0.05)
     assert mine.mean == pytest.approx(values.mean())
@@ -135,9 +149,9 @@ def test_an_interval_of_one_seed_agrees_with_the_bootstrap_over_streets():
 
 def test_streets_that_ask_for_nothing_are_left_out_and_none_at_all_is_an_error():
     table = np.array([[1.0, np.nan, 3.0], [1.0, 5.0, 3.0]])
-    assert paired_interval(table).mean == 2.0
+    assert crossed_interval(table).mean == 2.0
     with pytest.raises(DataError, match="no paired differences"):
-        paired_interval(np.full((2, 3), np.nan))
+        crossed_interval(np.full((2, 3), np.nan))
     assert np.isnan(table_of([{"a": {}}], "recall", ["a", "b"])).all()
 
 
@@ -170,6 +184,38 @@ def test_no_verdict_without_a_judge_without_motion_or_with_two_seeds():
     holds = judge_gate("keypoint_error", truth, trivial, more_is_better=False, unit="px")
     assert holds.holds
     assert find(good, bad, gate=holds, **sides).verdict == "better"
+
+
+def told(*verdicts: tuple[str, str]) -> dict[str, Any]:
+    """A study's tree with a question for each (verdict, reason)."""
+    gap = {"mean": 0.1, "low": -0.2, "high": 0.4}
+    questions = [
+        {"text": f"a against b{n}", "first": "a", "second": f"b{n}", "verdict": verdict,
+         "figures": {name: {"verdict": verdict, "reason": reason, "difference": gap} for name in FIGURES}}
+        for n, (verdict, reason) in enumerate(verdicts)
+    ]  # fmt: skip
+    arms = ["a", *(question["second"] for question in questions), *BESIDES]
+    return {
+        "questions": questions, "arms": {arm: dict.fromkeys(FIGURES, gap) for arm in arms}, "seeds": [0, 1, 2],
+        "plan": {"scale": {"val_clips": 4}}, "processor_s": {"in all": 60.0},
+    }  # fmt: skip
+
+
+def test_a_reason_that_all_questions_share_is_said_once():
+    reason = "neither arm surely beats the first frame held"
+    assert shared_reason(told(("inconclusive", reason), ("inconclusive", reason)), "min_ade").endswith(reason)
+    assert shared_reason(told(("inconclusive", reason), ("better", "the whole interval is above 0")), "min_ade") == ""
+
+
+def test_every_verdict_and_what_arms_stand_beside_are_drawn(tmp_path):
+    result = told(*((verdict, verdict) for verdict in ("better", "worse", "no difference", "inconclusive")))
+    draw_study(result, tmp_path / "all.png")
+    # Arms of a smoke run may lack a figure, and a study may have been drawn before a baseline was known.
+    result["arms"].pop("[another street]")
+    result["arms"]["b0"].pop("keypoint_error")
+    draw_study(result, tmp_path / "fewer.png")
+    whole, fewer = (cv2.imread(str(tmp_path / name)) for name in ("all.png", "fewer.png"))
+    assert whole is not None and fewer is not None and whole.shape == fewer.shape and (whole != fewer).any()
 
 
 def test_segments_agree_with_the_boxes_and_the_horizon():

@@ -6,8 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataset.tables import (
+    EGO_SCHEMA,
     FRAMES_SCHEMA,
     KEYPOINTS_SCHEMA,
+    SHARD_INDEX_SCHEMA,
     VideoIndex,
     keypoints_from_table,
     keypoints_table,
@@ -16,10 +18,12 @@ from dataset.tables import (
     read_index,
     read_keypoints,
     read_table,
+    table_of,
     write_ego,
     write_frames,
     write_index,
     write_keypoints,
+    write_table,
 )
 from labeling.camera import Trajectory, prior_intrinsics
 from labeling.ego_motion import EgoMotion, RoadView
@@ -143,3 +147,46 @@ def test_a_broken_table_is_named(tmp_path, broken):
         pq.write_table(pa.table({"frame": [1]}), path)
     with pytest.raises(DataError, match=r"k\.parquet"):
         read_table(path, KEYPOINTS_SCHEMA)
+
+
+def rewritten(path, metadata):
+    """As another tool writes it again: the same columns, other metadata."""
+    pq.write_table(pq.read_table(path).replace_schema_metadata(metadata), path)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "complaint"),
+    [
+        (None, "no info, sha256 in its metadata"),
+        ({"info": "{}"}, "no sha256 in its metadata"),
+        ({"info": "{}", "sha256": '"ab"', "tool": "spark"}, "metadata that is no JSON"),
+        ({"info": "[" * 100_000, "sha256": '"ab"'}, "metadata that is no JSON"),
+    ],
+    ids=["none", "one lost", "foreign", "nested"],
+)
+def test_a_table_that_another_tool_rewrote_is_an_error(tmp_path, metadata, complaint):
+    path = tmp_path / "i.parquet"
+    write_index(path, VideoIndex(times_s=np.zeros(1), is_keyframe=np.ones(1, bool), info={}, sha256="ab"))
+    rewritten(path, metadata)
+    with pytest.raises(DataError, match=f"i.parquet: has {complaint}.*; remove it and run again"):
+        read_index(path)
+
+
+def test_a_trajectory_without_its_camera_is_an_error(tmp_path):
+    path = tmp_path / "e.parquet"
+    pq.write_table(EGO_SCHEMA.empty_table(), path)
+    for metadata, complaint in (
+        (None, "no intrinsics, road"),
+        ({"intrinsics": "{}", "road": "{}"}, "other intrinsics"),
+    ):
+        rewritten(path, metadata)
+        with pytest.raises(DataError, match=f"has {complaint}"):
+            read_ego(path)
+
+
+def test_texts_that_are_no_texts_any_more_are_found_when_they_are_read(tmp_path):
+    path = tmp_path / "s.parquet"
+    write_table(path, table_of(SHARD_INDEX_SCHEMA, [{"key": "vvvvvvvv_0"}]))
+    path.write_bytes(path.read_bytes().replace(b"vvvvvvvv_0", b"\xff\xfe\xfdvvvvv_0"))
+    with pytest.raises(DataError, match="s.parquet: cannot be read as a table.*; remove it and run again"):
+        read_table(path, SHARD_INDEX_SCHEMA)

@@ -2,6 +2,7 @@
 
 import math
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import cast
 
@@ -183,6 +184,21 @@ def test_a_run_in_the_middle_is_the_same_frames(tmp_path: Path, container: str) 
     out = tmp_path / "run.mp4"
     frames = cut_run(source, planned(source), Span(start=55, end=100), out, picture=cover_map(128, 96, **SIZE))
     assert codes(out) == list(range(55, 100)) == frames.frame.tolist()
+
+
+@pytest.mark.parametrize(("fps", "held"), [(12, range(0)), (24, range(20, 44)), (12, range(10, 22))], ids=str)
+def test_what_is_shown_again_is_told(tmp_path: Path, fps: int, held: range) -> None:
+    """A source of fewer frames, and one whose camera froze for a second, which its own coder codes as what it is."""
+
+    def picture(index: int, width: int, height: int) -> np.ndarray:
+        return coded(held[0] if index in held else index, width, height)
+
+    count = 2 * fps
+    source = write_source(tmp_path / "source.mp4", regular_times(fps, count), picture=picture)
+    frames = cut_whole(source, tmp_path / "run.mp4")
+    shown = [min(frame * fps // 24, count - 1) for frame in range(len(frames.frame))]
+    of = [held[0] if index in held else index for index in shown]
+    assert frames.duplicate.tolist() == [False, *(a == b for a, b in pairwise(of))]
 
 
 @pytest.mark.parametrize("b_frames", [0, 3])

@@ -10,7 +10,7 @@ import pytest
 from labeling.backward_tracking import reach_back
 from labeling.box_tracker import BoxTracker, TrackerSettings
 from labeling.boxes import iou
-from labeling.labels import UNTRACKED, Keypoints
+from labeling.labels import POINT_INTERPOLATED, UNTRACKED, Keypoints
 from labeling.lane_tracker import LaneTracker, line_distance
 from labeling.tracking import RunTracker, TrackedLook, believed_tracks, drop_brief_tracks, trim_doubt
 
@@ -122,6 +122,24 @@ def test_each_category_may_begin_at_a_score_of_its_own() -> None:
         assert (named.track_id != UNTRACKED) is bool(begun)
 
 
+def test_growth_is_not_believed_while_nothing_confirms_it() -> None:
+    """A car comes nearer by 3 % a frame, stops where something hides it for a second, and is found where it stopped."""
+    sizes = [30 * 1.03 ** min(t, 30) for t in range(70)]
+    path = [box(300, width=size, height=size) if not 30 <= t < 54 else None for t, size in enumerate(sizes)]
+    ids = follow([path])[:, 0]
+    assert set(ids[54:]) == set(ids[:30]) == {0}
+
+
+@pytest.mark.parametrize(("times", "same"), [(1.7, True), (2.1, False)], ids=["a little", "a lot"])
+def test_what_is_suddenly_much_larger_is_another_object(times: float, same: bool) -> None:
+    for first, second in ((1.0, times), (times, 1.0)):
+        tracker = BoxTracker()
+        before, after = (
+            tracker.update(box(300, width=40, height=100 * size)[None], np.ones(1))[0] for size in (first, second)
+        )
+        assert bool(before == after) is same
+
+
 def test_frame_steps_scale_the_prediction() -> None:
     every, fourth = BoxTracker(), BoxTracker()
     dense = [every.update(box(50 + 5 * t)[None], np.ones(1))[0] for t in range(40)]
@@ -191,6 +209,13 @@ def test_a_track_that_was_never_sure_twice_in_a_row_is_not_believed() -> None:
         assert believed_tracks(seen, min_looks=2) == {0}
 
 
+@pytest.mark.parametrize(("at", "believed"), [((4, 6, 8), set()), ((4, 5), {0})], ids=["with gaps", "in a row"])
+def test_sure_looks_are_in_a_row_only_where_none_missed_it(at: tuple[int, ...], believed: set[int]) -> None:
+    seen = looks(*([car(t, 100)] if t in at else [] for t in range(10)))
+    assert {label.track_id for look in seen for label in look.labels} == {0}
+    assert believed_tracks(seen, min_looks=2, sure_looks=2, sure_scores={"car": 0.5}) == believed
+
+
 def test_a_track_is_shown_from_its_first_plain_frame_to_its_last() -> None:
     """What is doubtful before and after goes; in between it stays, and so does what has no doubt."""
     plain = {3, 4, 9}
@@ -204,9 +229,17 @@ def test_a_track_is_shown_from_its_first_plain_frame_to_its_last() -> None:
 
 def test_brief_tracks_are_dropped_but_where_a_run_begins_or_ends() -> None:
     long, brief = ([replace(car(t, 100), track_id=n) for t in range(*span)] for n, span in enumerate(((0, 9), (3, 7))))
-    assert drop_brief_tracks([*long, *brief], min_frames=5) == long
-    assert drop_brief_tracks([*long, *brief], min_frames=4) == [*long, *brief]
-    assert drop_brief_tracks([*long, *brief], min_frames=5, open_at=(6, 20)) == [*long, *brief]
+    clocks = range(9)
+    assert drop_brief_tracks([*long, *brief], clocks, min_frames=5) == long
+    assert drop_brief_tracks([*long, *brief], clocks, min_frames=4) == [*long, *brief]
+    assert drop_brief_tracks([*long, *brief], clocks, min_frames=5, open_at=(6, 20)) == [*long, *brief]
+
+
+def test_how_long_a_track_lasts_goes_by_the_clock() -> None:
+    """Four moments of two frames of the grid each last eight; of three that a camera froze in between, no longer."""
+    track = [replace(car(t, 100), track_id=0) for t in range(3, 7)]
+    assert drop_brief_tracks(track, range(0, 18, 2), pace=2, min_frames=8) == track
+    assert drop_brief_tracks(track, range(0, 18, 2), pace=2, min_frames=9) == []
 
 
 def test_a_sure_track_reaches_back_to_what_was_unsure() -> None:
@@ -217,6 +250,21 @@ def test_a_sure_track_reaches_back_to_what_was_unsure() -> None:
     assert sorted(label.frame for label in found) == [0, 1, 2, 4, 5]
     assert {label.track_id for label in found} == {0} and {label.score for label in found} == {0.3}
     assert reach_back(seen, set()) == []
+
+
+def test_what_is_reached_back_to_is_shown_between_looks() -> None:
+    """Looks every 6 frames; the third missed it, so that nothing is shown around that."""
+    every, sure = 6, 4
+    frames = [[] if n == 2 else [replace(car(n * every, 100), score=0.9 if n >= sure else 0.3)] for n in range(7)]
+    tracker = RunTracker()
+    seen = [
+        TrackedLook(frame=n * every, labels=tuple(tracker.update(labels, frame=n * every)), turn=np.eye(3))
+        for n, labels in enumerate(frames)
+    ]
+    found = reach_back(seen, {0})
+    assert sorted(label.frame for label in found) == [*range(7), *range(18, 24)]
+    between = [label for label in found if label.frame % every]
+    assert all((label.point_source[label.present] == POINT_INTERPOLATED).all() for label in between)
 
 
 def test_no_track_reaches_back_to_what_is_elsewhere_or_long_ago() -> None:

@@ -1,12 +1,14 @@
 """Recipes: the paper's numbers, unknown keys refused, the dry run's counts."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from training_fixtures import one_thread  # noqa: F401
 
 from labeling.errors import ConfigError
+from labeling.settings_files import laid_over
 from training.config import TrainConfig, backbone_config, config_names, load_config
 from training.dry_run import plan_run
 from training.trainer import train
@@ -57,8 +59,8 @@ def test_the_papers_recipe() -> None:
         ("backbone: tiny", "optimiser is missing"),
         ("stage: appearance\nbackbone: tiny\noptimiser: {steps: 3}", "trains stage 'appearance'"),
         ("backbone: tiny\noptimiser: {steps: 3}\nconditions: {coordinates: released}", "for sampling only"),
-        ("a: [", "is not YAML"),
-        ("- 1", "holds a list"),
+        ("a: [", "c.yaml: is no YAML"),
+        ("- 1", "needs a mapping of settings, holds list"),
     ],
     ids=[
         "unknown key",
@@ -168,3 +170,23 @@ def test_dry_run_memory_follows_the_knobs() -> None:
 def test_a_rate_that_is_none_is_refused(rate: float) -> None:
     with pytest.raises(ConfigError, match=f"--steps-per-second {rate:g} is no rate of steps"):
         plan_run(load_config("tiny", stage="motion"), steps_per_second=rate)
+
+
+@pytest.mark.parametrize("load", [load_config, backbone_config], ids=["recipe", "backbone"])
+def test_a_file_that_cannot_be_read_is_one_line(
+    load: Callable[..., object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: Path, **_: object) -> str:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    path = tmp_path / "mine.yaml"
+    path.write_text("name: tiny")
+    monkeypatch.setattr(Path, "read_text", refuse)
+    with pytest.raises(ConfigError, match=r"mine.yaml: cannot be read \(.*Permission denied.*\); check the path"):
+        load(path)
+
+
+def test_changes_are_laid_over_settings_at_every_depth() -> None:
+    base = {"a": {"b": 1, "c": {"d": 2}}, "e": [1, 2]}
+    assert laid_over(base, {"a": {"c": {"d": 3}}, "e": [4], "f": 5}) == {"a": {"b": 1, "c": {"d": 3}}, "e": [4], "f": 5}
+    assert base == {"a": {"b": 1, "c": {"d": 2}}, "e": [1, 2]}, "the base is left as it is"

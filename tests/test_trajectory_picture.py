@@ -1,6 +1,7 @@
 """The picture of a clip's trajectory: its numbers, and that it can be drawn of whatever a clip may be."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,8 +13,8 @@ from matplotlib.figure import Figure
 from dataset.receipts import Output, Receipt, ReceiptLog
 from dataset.selection import ClipRow, Selection, write_selection
 from dataset.tables import EgoTable, read_ego, write_ego
+from dataset.trajectory_marks import MODE_COLOURS
 from dataset.trajectory_picture import (
-    MODE_COLOURS,
     clip_motion,
     draw_trajectory,
     sliced,
@@ -21,6 +22,7 @@ from dataset.trajectory_picture import (
     write_trajectory_picture,
     yaw_rates_deg_s,
 )
+from dataset.trajectory_plan import plan_of, tick_step
 from labeling.camera import Trajectory, prior_intrinsics
 from labeling.ego_motion import EgoMotion, RoadView
 from labeling.errors import DataError
@@ -128,7 +130,56 @@ def test_modes_have_their_colours_and_doubt_pales_them(tmp_path):
 def test_any_clip_can_be_drawn_the_same_twice(tmp_path, count, speed):
     ego = stored(tmp_path / "e.parquet", driven(np.full(count, speed)), confidence=0.0)
     first, second = (pixels(draw_trajectory(sliced(ego, 0, count), title="k")) for _ in range(2))
-    assert np.array_equal(first, second) and first.shape == (1100, 1210, 3)
+    assert np.array_equal(first, second) and first.shape[1] > 900 and first.shape[0] > 600
+
+
+WAYS = {
+    "ahead": (8.0, 0.0), "a bend": (8.0, 5.0), "a turn": (6.0, 18.0), "to the left": (6.0, -18.0),
+    "a circle": (6.0, 75.0), "still": (0.0, 0.0), "on the spot": (0.0, 60.0), "backwards": (-3.0, 0.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_heads_and_views_open_to_where_the_camera_looks(tmp_path, way):
+    speed, rate = WAYS[way]
+    plan = plan_of(sliced(stored(tmp_path / "e.parquet", driven(np.full(121, speed), rate)), 0, 121))
+    assert len(plan.moments) == 6 and len(plan.apart) == (1 if way == "still" else 6)
+    for moment in plan.moments:
+        at, ahead = plan.way[moment], plan.looks[moment]
+        tip, *tail = (plan.head(moment) - at) @ ahead
+        assert tip > 0 and max(tail) < 0, "a dart's tip, and nothing else of it, is before the camera"
+        left, apex, right = plan.view(moment) - at
+        assert not apex.any() and left @ ahead == pytest.approx(plan.reach_m) == pytest.approx(right @ ahead)
+        assert left[0] * ahead[1] < left[1] * ahead[0] and right[0] * ahead[1] > right[1] * ahead[0]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_plan_shows_all_of_the_way_and_little_else(tmp_path, way):
+    speed, rate = WAYS[way]
+    ego = sliced(stored(tmp_path / "e.parquet", driven(np.full(121, speed), rate)), 0, 121)
+    plan = plan_of(ego)
+    drawn = np.concatenate([plan.way, *(plan.view(moment) for moment in plan.moments)])
+    assert (drawn >= plan.low).all() and (drawn <= plan.high).all()
+    figure = draw_trajectory(ego, title="k")
+    figure.draw_without_rendering()
+    box = figure.axes[0].get_window_extent()
+    metres_px = box.width / (plan.high - plan.low)[0]
+    assert metres_px == pytest.approx(box.height / (plan.high - plan.low)[1], rel=0.01), "a metre is a metre"
+    if np.ptp(plan.way, axis=0).max() > 6:
+        assert ((plan.high - plan.low) - np.ptp(plan.way, axis=0)).max() < 0.62 * np.ptp(plan.way, axis=0).max()
+
+
+@pytest.mark.parametrize("span", [3.0, 6.0, 17.3, 50.0, 149.0, 2000.0], ids=str)
+def test_ticks_are_round_and_few(span):
+    assert 5 <= span / tick_step(span) <= 12.5
+    assert f"{tick_step(span):e}"[0] in "125"
+
+
+def test_doubt_is_said_in_figures(tmp_path):
+    ego = sliced(stored(tmp_path / "e.parquet", driven(np.full(49, 6.0)), confidence=0.98), 0, 49)
+    ego = replace(ego, confidence=np.where(np.arange(49) == 24, np.float32(0.91), ego.confidence))
+    names = [axes.get_title(loc="left") for axes in draw_trajectory(ego, title="k").axes]
+    assert "confidence, median 0.98, least 0.91 at 1.0 s" in names
 
 
 def test_a_picture_that_cannot_be_written_is_an_error(job, tmp_path):

@@ -7,17 +7,15 @@ motion steps under a cosine, 5,000 appearance steps under a line, LoRA of rank 5
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from labeling.errors import ConfigError
-from labeling.settings_faults import settings_faults
+from labeling.settings_files import laid_over, parse_settings, read_yaml
 
 Stage = Literal["motion", "appearance", "end_to_end"]
 STAGES: tuple[Stage, ...] = ("motion", "appearance", "end_to_end")
-Model = TypeVar("Model", bound=BaseModel)
 CONFIG_FOLDER = Path(__file__).with_name("configs")
 
 
@@ -93,7 +91,7 @@ class BackboneConfig(_Settings):
         if isinstance(value, str):
             value = {"name": value}
         if isinstance(value, Mapping) and "kind" not in value and value.get("name") in BACKBONES:
-            return _merged(BACKBONES[value["name"]] | {"name": value["name"]}, value)
+            return laid_over(BACKBONES[value["name"]] | {"name": value["name"]}, value)
         if isinstance(value, Mapping) and "kind" not in value and "name" in value:
             raise ValueError(f"not a preset; choose one of {', '.join(BACKBONES)}, or say its kind")
         return value
@@ -246,12 +244,13 @@ def backbone_config(name_or_path: str | Path, **overrides: Any) -> BackboneConfi
     """A backbone by preset name, or from a YAML file of its fields; ``overrides`` replace single fields.
 
     Raises:
-        ConfigError: no such preset or file, an unknown key, a value of the wrong kind.
+        ConfigError: no such preset or file, a file that cannot be read or is no YAML, an unknown key, a value of the
+            wrong kind.
     """
     if str(name_or_path) in BACKBONES:
         tree: dict[str, Any] = {"name": str(name_or_path)}
     elif Path(name_or_path).is_file():
-        tree = _read_yaml(Path(name_or_path))
+        tree = read_yaml(Path(name_or_path))
         tree = (
             tree.get("backbone", tree) if isinstance(tree.get("backbone", tree), dict) else {"name": tree["backbone"]}
         )
@@ -259,7 +258,7 @@ def backbone_config(name_or_path: str | Path, **overrides: Any) -> BackboneConfi
         raise ConfigError(
             f"backbone {str(name_or_path)!r} is not known; choose one of {', '.join(BACKBONES)} or a file"
         )
-    return _validated(BackboneConfig, _merged(tree, overrides), str(name_or_path))
+    return parse_settings(BackboneConfig, laid_over(tree, overrides), str(name_or_path))
 
 
 def load_config(
@@ -273,7 +272,8 @@ def load_config(
         overrides: a nested mapping laid over the file.
 
     Raises:
-        ConfigError: no such recipe, YAML that does not parse, an unknown key, a wrong value, stages that disagree.
+        ConfigError: no such recipe, a file that cannot be read or is no YAML, an unknown key, a wrong value, stages
+            that disagree.
     """
     path = Path(name_or_path)
     if not path.is_file():
@@ -282,39 +282,14 @@ def load_config(
         raise ConfigError(
             f"no training config {str(name_or_path)!r}; give a YAML file or one of {', '.join(config_names())}"
         )
-    tree = _read_yaml(path)
+    tree = read_yaml(path)
     if isinstance(tree.get("backbone"), str):
         tree["backbone"] = {"name": tree["backbone"]}
-    tree = _merged(tree, overrides or {})
+    tree = laid_over(tree, overrides or {})
     if stage is not None and tree.setdefault("stage", stage) != stage:
         raise ConfigError(
             f"{path.name} trains stage {tree['stage']!r}, but {stage!r} was asked for; take another config"
         )
     if not tree.get("name"):
         tree["name"] = path.stem
-    return _validated(TrainConfig, tree, path.name)
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(tree, dict):
-        raise ConfigError(f"{path} holds a {type(tree).__name__}, not settings by name")
-    return tree
-
-
-def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in over.items():
-        nested = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
-        merged[key] = _merged(merged[key], value) if nested else value
-    return merged
-
-
-def _validated(model: type[Model], tree: Mapping[str, Any], label: str) -> Model:
-    try:
-        return model.model_validate(tree)
-    except ValidationError as error:
-        raise ConfigError(f"{label}: {settings_faults(model, error)}") from error
+    return parse_settings(TrainConfig, tree, path.name)

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from training.criteria import PCK_SHARE
 from training.evaluation import PARTS, ClipScore, Part, SampleEstimate
 from training.evaluation_files import video_rate
-from training.label_agreement import PCK_SHARE
 from training.metrics import Interval, mean_interval, paired_interval
 
 SAMPLES, TRUE_SKELETONS = "samples", "true skeletons"

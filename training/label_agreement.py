@@ -8,19 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
-from labeling.boxes import iou
+from labeling.boxes import best_pairs
 from labeling.camera import PictureMap
 from labeling.errors import DataError
 from labeling.labels import Keypoints
 from labeling.skeleton_video import DEFAULT_STYLE
+from training.criteria import MATCH_IOU, PCK_SHARE
 from training.metrics import pck
 
-MATCH_IOU = 0.3
-"""Least overlap of two boxes that are taken for one object."""
-PCK_SHARE = 0.1
-"""Points within this share of the box diagonal are right."""
 LEAST_POINTS = 4
 """Objects that show fewer points are not compared."""
 LEAST_SCORE = DEFAULT_STYLE.min_score
@@ -147,15 +143,12 @@ def match_objects(found: Sequence[Keypoints], wanted: Sequence[Keypoints]) -> li
     for ours, theirs in groups.values():
         if not ours or not theirs:
             continue
-        overlaps = iou(
-            np.stack([found[i].box_xyxy for i in ours]).astype(np.float64),
-            np.stack([wanted[j].box_xyxy for j in theirs]).astype(np.float64),
-        )
-        # A pair too far apart is worth nothing, so that it never keeps a true pair from being made.
-        worth = np.where(overlaps >= MATCH_IOU, overlaps, 0.0)
-        for row, column in zip(*linear_sum_assignment(worth, maximize=True), strict=True):
-            if worth[row, column] > 0:
-                pairs.append((ours[row], theirs[column], float(worth[row, column])))
+        found_boxes = np.stack([found[i].box_xyxy for i in ours]).astype(np.float64)
+        wanted_boxes = np.stack([wanted[j].box_xyxy for j in theirs]).astype(np.float64)
+        pairs += [
+            (ours[row], theirs[column], overlap)
+            for row, column, overlap in best_pairs(found_boxes, wanted_boxes, least_iou=MATCH_IOU)
+        ]
     return pairs
 
 

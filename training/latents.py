@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from dataset.layout import LATENTS
 from dataset.receipts import digest, hashed_share, make_folder, storage_errors, sync_folder
 from labeling.camera import Intrinsics
 from labeling.errors import ConfigError, DataError
@@ -106,7 +107,7 @@ def cache_latents(
         backbone.config if backbone else backbone_config(backbone_name, **({"picture": picture} if picture else {}))
     )
     datasets = datasets or _shard_datasets(Path(job_dir))
-    folder = out or Path(job_dir) / "latents" / config.name
+    folder = out or Path(job_dir) / LATENTS / config.name
     samples = [(split, sample) for split, dataset in datasets.items() for sample in dataset]
     if not samples:
         raise DataError(f"{job_dir} has no clips to cache; `animatic status` says what was dropped and why")
@@ -343,7 +344,7 @@ def open_store(job_dir: Path, config: BackboneConfig) -> LatentStore:
         DataError: nothing was cached.
     """
     own = Path(job_dir)
-    return LatentStore(own if (own / MANIFEST).is_file() else own / "latents" / config.name)
+    return LatentStore(own if (own / MANIFEST).is_file() else own / LATENTS / config.name)
 
 
 def check_store(store: LatentStore, config: BackboneConfig, *, vae_fingerprint: str | None = None) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from labeling.camera import invert, rigid, rotation_angle_deg
 from labeling.errors import DataError
+from training.criteria import PCK_SHARE
 
 Alignment = Literal["none", "se3", "sim3"]
 _GROUND = [0, 2]
@@ -189,7 +190,9 @@ def paired_interval(
     return mean_interval(differences, [groups[key] for key in both], draws=draws, seed=seed)
 
 
-def pck(predicted: np.ndarray, truth: np.ndarray, box_xyxy: np.ndarray, *, threshold: float = 0.1) -> tuple[int, int]:
+def pck(
+    predicted: np.ndarray, truth: np.ndarray, box_xyxy: np.ndarray, *, threshold: float = PCK_SHARE
+) -> tuple[int, int]:
     """Points within ``threshold`` of the box diagonal, and points that the truth shows (Yang and Ramanan 2013).
 
     Args:

@@ -11,11 +11,11 @@ import torch
 from labeling.detection import LETTERBOX_GREY
 from labeling.model_cards import IMAGENET_MEAN, ModelCard
 from labeling.schemas import Category, KeypointSchema, keypoint_schema
+from training.criteria import JUDGED_HEIGHT_PX, JUDGED_SHARE
 from training.street_augment import AugmentSettings, disturb, map_boxes, map_points, put_board, random_map
 from training.street_losses import MINOR
 from training.street_networks import FIELD_STRIDE
 from training.street_pool import PICTURE_SCALE, ObjectTruth, PoolCrop, PoolFrame, StreetPool, frames_with
-from training.street_scores import JUDGED_HEIGHT_PX, JUDGED_SHARE
 from training.street_targets import FieldVotes, GridTargets, encode_boxes, encode_fields, encode_responses
 
 CLASSES: tuple[Category, ...] = ("car", "person")

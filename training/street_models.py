@@ -1,9 +1,10 @@
 """Train, export and judge the small shipped extractors of the synthetic street: ``python -m training.street_models``.
 
 On processors everything follows from the seeds: pool, batches, weights, ONNX bytes (on one kind of processor),
-thresholds, figures. On a GPU (``--device cuda``), from which the shipped weights come, pool and batches do; its sums,
-and so the weights, differ in their last digits from run to run. With ``--checkpoints FOLDER`` a run that was stopped
-goes on where it was; of models whose training has ended, it exports and judges what is there, without a GPU.
+thresholds, figures. On a GPU (``--device cuda``) pool and batches do; its sums, and so the weights, differ in their
+last digits from run to run. Where the shipped weights come from, ``docs/street_models.md`` tells. With ``--checkpoints
+FOLDER`` a run that was stopped goes on where it was; of models whose training has ended, it exports and judges what is
+there, without a GPU.
 """
 
 import argparse

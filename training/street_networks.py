@@ -11,9 +11,9 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from labeling.model_cards import DETECTOR_STRIDES
 from labeling.schemas import keypoint_schema
 
-DETECTOR_STRIDES = (8, 16, 32)
 FIELD_STRIDE = 8
 MAX_LOG_SIZE = 5.0
 """Sides of no object are more cells than its exponential."""

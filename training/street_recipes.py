@@ -7,7 +7,9 @@ from typing import Any, Literal, get_args
 import torch
 from torch import nn
 
+from labeling.detection import grid_cells
 from labeling.model_cards import CifcafCard, FieldHeadCard, ModelCard, SimccCard, YoloxCard
+from training.criteria import JUDGED_HEIGHT_PX
 from training.street_augment import AugmentSettings
 from training.street_batches import (
     CLASSES,
@@ -29,9 +31,7 @@ from training.street_networks import (
     SimccNetwork,
 )
 from training.street_pool import PICTURE_SCALE, PICTURE_SIZE, StreetPool
-from training.street_scores import JUDGED_HEIGHT_PX
 from training.street_second_look import OBJECTS, TwoLookDetector, TwoLookGraph
-from training.street_targets import grid_cells
 
 ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_fields"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
@@ -65,7 +65,7 @@ _FIELD_DECODING: dict[str, dict[str, float]] = {
 _LICENCE = "Apache-2.0"
 _DETECTOR_SOURCE = (
     "ships with Animatic; its first look was trained by `make street-models DEVICE=cuda`, which trains and exports the "
-    "same network from seeds; README tells how it went on"
+    "same network from seeds; docs/street_models.md tells how it went on"
 )
 _SOURCE = "ships with Animatic; `make street-models DEVICE=cuda` trains and exports it again from seeds"
 
@@ -104,7 +104,7 @@ BUDGETS: dict[Device, Budget] = {
     ),
 }  # fmt: skip
 """Two cores in under an hour; one GPU with sixteen cores in under ten minutes, from which the shipped models come, but
-for the detector, which went on from there (README)."""
+for the detector, which went on from there (``docs/street_models.md``)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,16 +15,17 @@ from labeling.detection import Detections, Detector
 from labeling.fields import FieldModel
 from labeling.keypoints import KeypointHead
 from labeling.labels import Keypoints
+from training.criteria import (
+    EXCUSED_SHARE,
+    HIDDEN_SCORE,
+    JUDGED_HEIGHT_PX,
+    JUDGED_SHARE,
+    LANE_MATCH_PX,
+    MATCH_IOU,
+    PCK_SHARE,
+    SURE_SCORE,
+)
 from training.street_pool import ObjectTruth
-
-JUDGED_HEIGHT_PX = 32.0
-JUDGED_SHARE = 0.3
-PCK_SHARE = 0.1
-_MATCH_IOU = 0.3
-_EXCUSED_SHARE = 0.5
-_LANE_MATCH_PX = 20.0
-HIDDEN_SCORE = 0.3
-SURE_SCORE = 0.9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +125,7 @@ def match_boxes(boxes_xyxy: np.ndarray, truths: Sequence[BoxTruth]) -> tuple[np.
         overlap, covered = box_overlaps(box, boxes)
         overlap[partner >= 0] = 0
         best = int(overlap.argmax()) if len(overlap) else -1
-        if best >= 0 and overlap[best] >= _MATCH_IOU:
+        if best >= 0 and overlap[best] >= MATCH_IOU:
             partner[best] = index
         elif not is_excused(box, truths, covered):
             phantoms.append(index)
@@ -141,7 +142,7 @@ def is_excused(box_xyxy: np.ndarray, truths: Sequence[BoxTruth], covered: np.nda
     """
     if box_xyxy[3] - box_xyxy[1] < JUDGED_HEIGHT_PX:
         return True
-    return any(not is_judged(truth) and share > _EXCUSED_SHARE for truth, share in zip(truths, covered, strict=True))
+    return any(not is_judged(truth) and share > EXCUSED_SHARE for truth, share in zip(truths, covered, strict=True))
 
 
 def box_overlaps(box: np.ndarray, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -184,7 +185,7 @@ def judge_lanes(found: list[np.ndarray], truths: tuple[ObjectTruth, ...], tally:
         shown = points[points[:, 2] > 0, :2]
         gaps = {index: float(np.mean(distance_to_curve(shown, curves[index]))) for index in free}
         best = min(gaps, key=lambda index: gaps[index], default=-1)
-        if best < 0 or gaps[best] > _LANE_MATCH_PX:
+        if best < 0 or gaps[best] > LANE_MATCH_PX:
             phantoms += 1
             continue
         free.remove(best)

@@ -15,7 +15,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from training.street_networks import DETECTOR_STRIDES, MAX_LOG_SIZE, FirstLook, StreetDetector
+from labeling.model_cards import DETECTOR_STRIDES
+from training.street_networks import MAX_LOG_SIZE, FirstLook, StreetDetector
 
 CANDIDATES, OBJECTS = 128, 64
 """Of a picture's cells so many of the best are compared, and so many of those looked at again; the rest are nothing."""

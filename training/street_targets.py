@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labeling.model_cards import DETECTOR_STRIDES
 from labeling.schemas import KeypointSchema
-from training.street_networks import DETECTOR_STRIDES
 
 LEVEL_LIMITS_PX = (0.0, 40.0, 88.0, np.inf)
 """Root of the box area from which each stride of the detector is responsible, input pixels."""
@@ -55,16 +55,6 @@ class FieldTargets:
 
     cif: FieldVotes
     caf: FieldVotes
-
-
-def grid_cells(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row (A, 2) and stride (A,) of every cell, both float32, in the order of the network's output."""
-    cells, strides = [], []
-    for stride in DETECTOR_STRIDES:
-        columns, rows = np.meshgrid(np.arange(width // stride), np.arange(height // stride))
-        cells.append(np.stack([columns, rows], axis=2).reshape(-1, 2))
-        strides.append(np.full(columns.size, stride))
-    return np.concatenate(cells).astype(np.float32), np.concatenate(strides).astype(np.float32)
 
 
 def encode_boxes(

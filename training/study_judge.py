@@ -19,12 +19,12 @@ from torch import nn
 from torch.nn import functional
 
 from labeling.camera import invert, rigid
-from labeling.detection import decode_yolox
+from labeling.detection import decode_yolox, grid_cells
 from labeling.model_cards import SoftSuppression, YoloxCard, load_cards
 from training.street_fitting import FitSettings, fit
 from training.street_losses import detector_loss
 from training.street_networks import DetectorGraph, StreetDetector, conv_unit
-from training.street_targets import encode_boxes, grid_cells
+from training.street_targets import encode_boxes
 from training.tiny import seeded
 
 PAIR_FRAMES = 4

@@ -8,15 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
-from labeling.boxes import iou
+from labeling.boxes import best_pairs
+from training.criteria import MATCH_IOU
 from training.evaluation import trajectory_scores
 from training.study_judge import Reading
 
 CAP_PX = 12.0
 """The most that one car in one frame can count, pixels of the study's picture."""
-MATCH_IOU = 0.3
 LABEL_SCALE = 2.0
 """Boxes are in pixels of twice the picture."""
 FIGURES: dict[str, tuple[str, bool]] = {
@@ -87,14 +86,9 @@ def track_scores(found: Sequence[np.ndarray], tracks: Sequence[TrueTrack]) -> di
 
 def _matched(truth: np.ndarray, found: np.ndarray) -> list[tuple[int, float]]:
     """Rows of the truth that were found, each with the mean distance of the corners, pixels of the picture."""
-    overlaps = iou(truth, found)
-    if not overlaps.size:
-        return []
-    pairs = zip(*linear_sum_assignment(-overlaps), strict=True)
     return [
-        (int(row), corner_distance(truth[row], found[column]) / LABEL_SCALE)
-        for row, column in pairs
-        if overlaps[row, column] >= MATCH_IOU
+        (row, corner_distance(truth[row], found[column]) / LABEL_SCALE)
+        for row, column, _ in best_pairs(truth, found, least_iou=MATCH_IOU)
     ]
 
 

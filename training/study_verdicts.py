@@ -39,8 +39,9 @@ class Gate:
     reason: str
 
 
-def paired_interval(differences: np.ndarray, *, draws: int = _DRAWS, seed: int = 0) -> Interval:
-    """Mean and 95 % interval of paired differences (S seeds, V streets); NaN where a street asks for nothing.
+def crossed_interval(differences: np.ndarray, *, draws: int = _DRAWS, seed: int = 0) -> Interval:
+    """Mean and 95 % interval of paired differences (S seeds, V streets), both drawn anew in each bootstrap draw; NaN
+    where a street asks for nothing.
 
     Raises:
         DataError: nothing to compare.
@@ -70,7 +71,7 @@ def judge_gate(
         unit: for the reason.
     """
     sign = 1.0 if more_is_better else -1.0
-    unsure = [name for name, values in trivial.items() if paired_interval(sign * (truth - values)[None]).low <= 0]
+    unsure = [name for name, values in trivial.items() if crossed_interval(sign * (truth - values)[None]).low <= 0]
     shown = ", ".join(f"{np.nanmean(values):.2f} for {name}" for name, values in trivial.items())
     reason = f"on the truth through the VAE the judge reads {np.nanmean(truth):.2f} {unit}, against {shown}"
     return Gate(
@@ -98,14 +99,14 @@ def find(
         where the interval holds 0 and reaches beyond ``same``.
     """
     sign = 1.0 if more_is_better else -1.0
-    difference = paired_interval(sign * (first - second))
+    difference = crossed_interval(sign * (first - second))
     if not gate.holds:
         return Finding(verdict="inconclusive", reason="the judge cannot judge this", difference=difference)
     if len(first) < LEAST_SEEDS:
         reason = f"{len(first)} of at least {LEAST_SEEDS} seeds"
         return Finding(verdict="inconclusive", reason=reason, difference=difference)
     for name, values in trivial.items():
-        if all(paired_interval(sign * (arm - values[None])).low <= 0 for arm in (first, second)):
+        if all(crossed_interval(sign * (arm - values[None])).low <= 0 for arm in (first, second)):
             return Finding(
                 verdict="inconclusive", reason=f"neither arm surely beats {name}", difference=difference
             )  # fmt: skip

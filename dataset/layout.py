@@ -5,8 +5,15 @@ import re
 from labeling.errors import DataError
 from labeling.timeline import Span, run_name
 
+JOB_FILE = "job.yaml"
 SELECTION = "selection.parquet"
-SHARD_INDEX = "shards/index.parquet"
+RECEIPTS = "receipts"
+SHARDS = "shards"
+INDEX_NAME = "index.parquet"
+"""In whatever folder shards lie."""
+SHARD_INDEX = f"{SHARDS}/{INDEX_NAME}"
+LATENTS = "latents"
+"""A folder per backbone."""
 REPORT = "report.html"
 
 
@@ -48,7 +55,7 @@ def clip_path(video_id: str, key: str, suffix: str) -> str:
 
 def shard_path(name: str) -> str:
     """A shard's tar, or its rows of the index."""
-    return f"shards/{name}"
+    return f"{SHARDS}/{name}"
 
 
 def parse_run_item(item: str) -> tuple[str, Span]:
