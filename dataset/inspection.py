@@ -144,8 +144,24 @@ def clip_verdict(job: Path, key: str) -> ClipRow:
     for row in rows:
         if row.key == key:
             return row
-    near = ", ".join(row.key for row in rows[:3]) or "none"
+    # Those that can be shown: what was dropped is as little to be looked at as what is not there.
+    packed = [key for keys in packed_keys(job).values() for key in keys] if _has_shards(job) else []
+    likely = packed or [row.key for row in rows if row.kept] or [row.key for row in rows]
+    near = ", ".join(likely[:3]) or "none"
     raise DataError(f"{job}: has no clip {key!r}; keys are <video_id>_<start_frame>, such as {near}")
+
+
+def packed_keys(job: Path) -> dict[str, list[str]]:
+    """The keys of the clips in a job's shards, by split.
+
+    Raises:
+        DataError: there are no shards.
+    """
+    return {split: ShardDataset(job, split).keys for split in ("train", "val")}
+
+
+def _has_shards(job: Path) -> bool:
+    return (job / SHARD_INDEX).is_file()
 
 
 def find_sample(job: Path, key: str | None = None) -> Sample:

@@ -20,6 +20,8 @@ from labeling.timeline import ClipPlan, Span, Timeline, clip_key
 SelectionMode = Literal["auto", "extend", "refreeze"]
 
 _LEAST_GAP_S = 1.0
+_SAME_AS = "same_as="
+"""The reason of clips whose video has the bytes of another: its id follows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,6 +172,7 @@ def select_clips(
     rule_digest: str,
     previous: Selection | None = None,
     mode: SelectionMode = "auto",
+    twins: Mapping[str, Sequence[str]] | None = None,
 ) -> Selection:
     """Judge every clip.
 
@@ -181,6 +184,9 @@ def select_clips(
         previous: the selection so far.
         mode: ``auto`` extends a selection that was made by the same rule and makes a new one otherwise; ``extend``
             does the former or fails; ``refreeze`` makes a new one.
+        twins: by video id, all ids of the same content, that one among them. One of them is judged, the first or the
+            one that a selection which is extended holds already; the clips of the others are dropped, since the same
+            footage must neither count twice nor stand in both splits.
 
     Raises:
         ConfigError: ``extend`` without a selection or after the rule has changed, or a split that lacks a video.
@@ -188,7 +194,8 @@ def select_clips(
     if mode == "extend":
         check_extendable(previous, rule_digest)
     if previous is not None and mode != "refreeze" and previous.rule_digest == rule_digest:
-        return _extended(candidates, rule, previous, digests)
+        return _extended(_without_twins(candidates, twins, previous), rule, previous, digests)
+    candidates = _without_twins(candidates, twins, None)
     free = [row for rows in candidates.values() for row in rows if row.kept]
     threshold = object_threshold([row.objects for row in free if row.objects is not None], rule.keep_share)
     cutoff = _sample_cutoff([row for row in free if _enough(row, threshold)], rule)
@@ -201,6 +208,30 @@ def select_clips(
         digests=dict(digests),
         rule_digest=rule_digest,
     )
+
+
+def twin_holders(selection: Selection) -> dict[str, str]:
+    """By video id, the one that stands for it: of videos whose clips are dropped because another has the same bytes."""
+    return {row.video_id: row.reason.removeprefix(_SAME_AS) for row in selection.rows if _is_twin(row) and row.reason}
+
+
+def _is_twin(row: ClipRow) -> bool:
+    return (row.reason or "").startswith(_SAME_AS)
+
+
+def _without_twins(
+    candidates: Mapping[str, Sequence[ClipRow]], twins: Mapping[str, Sequence[str]] | None, previous: Selection | None
+) -> dict[str, Sequence[ClipRow]]:
+    """The candidates, with whole clips of all but one of the videos of the same content dropped."""
+    judged = set(previous.digests) - set(twin_holders(previous)) if previous else set()
+    result = dict(candidates)
+    for name, same in (twins or {}).items():
+        there = [other for other in same if other in candidates]
+        holder = min(there, key=lambda other: (other not in judged, other), default=name)
+        if holder != name and name in candidates:
+            dropped = f"{_SAME_AS}{holder}"
+            result[name] = [replace(row, kept=False, reason=dropped) if row.kept else row for row in candidates[name]]
+    return result
 
 
 def check_extendable(previous: Selection | None, rule_digest: str) -> None:
@@ -230,7 +261,9 @@ def _extended(
     if rule.split or not known:
         splits = video_splits(list(candidates), rule, kept={row.video_id for row in rows if row.kept})
     else:
-        splits = {**_hashed_splits(new, rule), **known}
+        # Footage keeps its split when its video is taken out and one of the same bytes stands in.
+        heirs = {name: known[gone] for name, gone in twin_holders(previous).items() if gone in known}
+        splits = {**_hashed_splits(new, rule), **heirs, **known}
     return replace(previous, rows=_ordered(_split(rows, splits)), rounds=rounds, digests=dict(digests))
 
 

@@ -18,6 +18,8 @@ IntrinsicsSource = Literal["given", "metadata", "estimated", "prior"]
 
 _ROTATION_TOLERANCE = 1e-3
 _FOCAL_LIMITS = (0.2, 5.0)
+_FARTHEST_M = 1e8
+"""Of a position in a file: more than the earth is round."""
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 
 
@@ -290,6 +292,7 @@ def read_tum(path: Path) -> Trajectory:
         at = int(np.argmax(wrong))
         raise TrajectoryError(f"{path}: row {at} has a quaternion of length {lengths[at]:.3g}; give unit qx qy qz qw")
     check_times(rows[:, 0])
+    _check_positions(rows[:, 1:4], path)
     return rebased_trajectory(rows[:, 0], rigid(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4]))
 
 
@@ -302,7 +305,17 @@ def read_kitti(path: Path, *, fps: float) -> Trajectory:
     rows = _read_rows(path, columns=12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
+    _check_positions(poses[:, :3, 3], path)
     return rebased_trajectory(np.arange(len(rows)) / fps, poses)
+
+
+def _check_positions(positions_m: np.ndarray, path: Path) -> None:
+    """Raise ``TrajectoryError`` for a position that is on no road: what is not finite is told of by ``Trajectory``."""
+    wrong = (np.abs(positions_m) > _FARTHEST_M).any(axis=1)
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        far = float(np.abs(positions_m[at]).max())
+        raise TrajectoryError(f"{path}: row {at} lies {far:.3g} m from the origin; give metres below {_FARTHEST_M:g}")
 
 
 def _read_rows(path: Path, *, columns: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -52,6 +52,14 @@ def _neighbours(model: type[BaseModel], place: tuple[int | str, ...]) -> list[st
     """The fields that there are where an unknown one was given."""
     known: Any = model
     for part in place[:-1]:
-        fields = getattr(known, "model_fields", {})
-        known = fields[part].annotation if part in fields else None
-    return list(getattr(known, "model_fields", ()))
+        fields = getattr(_model_in(known), "model_fields", {})
+        # A part that is no field is a key of a mapping, and what it holds is of the same kind for all keys.
+        known = fields[part].annotation if part in fields else known
+    return list(getattr(_model_in(known), "model_fields", ()))
+
+
+def _model_in(annotation: Any) -> Any:
+    """The settings in ``Settings``, ``Settings | None`` or ``dict[str, Settings]``; None where there are none."""
+    if hasattr(annotation, "model_fields"):
+        return annotation
+    return next((found for part in get_args(annotation) if (found := _model_in(part)) is not None), None)

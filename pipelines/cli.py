@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from pipelines.cli_errors import USAGE_ERRORS, print_usage_error, refuse_empty_paths
 from pipelines.cli_options import (
     LABEL,
     LOOK,
@@ -43,17 +44,18 @@ def main() -> None:
     from labeling.errors import AnimaticError
 
     try:
-        app()
+        refuse_empty_paths(app, sys.argv[1:])
+        code = app(standalone_mode=False)
     except AnimaticError as error:
         from pipelines.console import print_error
 
         print_error(error)
         sys.exit(2)
-    except SystemExit as stop:
-        # typer makes this of Ctrl-C, without a word.
-        if stop.code == STOPPED:
-            print("stopped; run the same command again to go on", file=sys.stderr)
-        raise
+    except USAGE_ERRORS as error:
+        print_usage_error(error)
+        sys.exit(2)
+    except typer.Abort:
+        sys.exit(1)
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             from pipelines.console import print_error
@@ -64,6 +66,10 @@ def main() -> None:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    # typer makes this of Ctrl-C, without a word.
+    if code == STOPPED:
+        print("stopped; run the same command again to go on", file=sys.stderr)
+    sys.exit(code if isinstance(code, int) else 0)
 
 
 def _too_long(error: OSError) -> Exception:
@@ -256,12 +262,13 @@ def inspect(
     trajectory: Annotated[
         Path | None, typer.Option(help="Write the clip's way from above, its speed and yaw rate here (.png).")
     ] = None,
+    keys: Annotated[bool, typer.Option("--keys", help="List the packed clips, each with its split.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """The dataset in numbers, or one clip's record, contact sheet and trajectory."""
     from pipelines.status import inspect as inspect_job
 
-    raise typer.Exit(inspect_job(job, key, sheet=sheet, trajectory=trajectory, as_json=as_json))
+    raise typer.Exit(inspect_job(job, key, sheet=sheet, trajectory=trajectory, as_json=as_json, keys=keys))
 
 
 @app.command(rich_help_panel=LOOK)
@@ -330,7 +337,7 @@ def export_coco(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for the JSON file, and with --images for its pictures.")
     ],
-    split: Annotated[str, typer.Option(help="train or val.")] = "train",
+    split: Annotated[str | None, typer.Option(help="train or val; by default both.")] = None,
     images: Annotated[
         bool, typer.Option("--images", help="Write the frames that the file names as JPEG files too.")
     ] = False,

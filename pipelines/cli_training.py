@@ -26,6 +26,7 @@ def cache(
     """Latents of every clip, once per backbone."""
     from pipelines.train import run_cache
 
+    _tell_stale(job)
     run_cache(
         job, backbone=backbone, part=part, object_variants=object_variants, device=device, refresh=refresh,
         controls=tuple(controls.split(",")) if controls else (),
@@ -45,10 +46,20 @@ def train(
     """One LoRA adapter on the frozen backbone."""
     from pipelines.train import run_train
 
+    _tell_stale(data)
     result = run_train(
         stage, data=data, config=config, out=out, resume=resume, dry_run=dry_run, steps_per_second=steps_per_second
     )
     raise typer.Exit(STOPPED if getattr(result, "interrupted", False) else 0)
+
+
+def _tell_stale(job: Path) -> None:
+    """A line, where the job's shards are out of date; of several processes one speaks."""
+    from pipelines.console import make_console
+    from pipelines.stale_shards import print_stale_shards
+
+    if os.environ.get("RANK", "0") == "0":
+        print_stale_shards(job, make_console())
 
 
 @commands.command(rich_help_panel=TRAIN)

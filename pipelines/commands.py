@@ -1,14 +1,14 @@
 """What the labelling commands do: settings from options, a job, its stages, and an exit code."""
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
 
-from dataset.layout import SELECTION
+from dataset.layout import JOB_FILE, SELECTION
 from dataset.receipts import Receipt, make_folder
 from dataset.selection import check_split, read_selection
 from labeling.captions import read_caption_table
@@ -18,12 +18,13 @@ from labeling.extractors import ExtractorChoice, Extractors, choose_extractors
 from labeling.onnx_model import resolve_providers
 from labeling.settings_files import read_yaml
 from pipelines.config import EFFORTS, Config, merged, parse_config, with_effort
-from pipelines.console import ConsoleReporter, counted, print_damaged, print_failures
+from pipelines.console import ConsoleReporter, counted, print_damaged, print_failures, print_twins
 from pipelines.damage import damaged_videos
 from pipelines.engine import Engine
 from pipelines.given_tables import read_cameras, read_split
 from pipelines.imports import import_trajectories
 from pipelines.job import Job, open_job, open_or_create
+from pipelines.job_changes import job_changes
 from pipelines.label import ALL_STAGES, SLICE_STAGES, StageReport, run_stages, sweep_outdated
 from pipelines.models import check_models_folder
 from pipelines.nothing_left import clips_packed, why_nothing_is_left
@@ -58,7 +59,7 @@ def run_label(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
         AnimaticError: something a person can mend before anything is spent.
     """
     reporter = ConsoleReporter()
-    job = prepare_job(videos, out, options, check=lambda job: check_extractors(job, reporter))
+    job = prepare_job(videos, out, options, check=lambda job: check_extractors(job, reporter), reporter=reporter)
     reports = run_job(job, ALL_STAGES, options, reporter)
     sweep_outdated(job)
     return _finish(job, reports, reporter)
@@ -67,14 +68,14 @@ def run_label(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
 def run_slice(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
     """Index and cut with every clip kept; 0, or 1 where something failed."""
     reporter = ConsoleReporter()
-    job = prepare_job(videos, out, options)
+    job = prepare_job(videos, out, options, reporter=reporter)
     return _finish(job, run_job(job, SLICE_STAGES, options, reporter), reporter)
 
 
 def run_index(videos: Sequence[Path], out: Path, options: JobOptions) -> int:
     """Index, on a new job or one that is there; 0, or 1 where something failed."""
     reporter = ConsoleReporter()
-    job = prepare_job(videos, out, options, check=chosen_cards)
+    job = prepare_job(videos, out, options, check=chosen_cards, reporter=reporter)
     return _finish(job, run_job(job, COMMAND_STAGES["index"], options, reporter), reporter)
 
 
@@ -125,8 +126,9 @@ def run_select(out: Path, *, extend: bool = False, refreeze: bool = False, worke
 
 
 def prepare_job(
-    videos: Sequence[Path], out: Path, options: JobOptions, *, check: Callable[[Job], object] | None = None
-) -> Job:
+    videos: Sequence[Path], out: Path, options: JobOptions, *, check: Callable[[Job], object] | None = None,
+    reporter: ConsoleReporter | None = None,
+) -> Job:  # fmt: skip
     """The job with its settings and videos, written to ``job.yaml``.
 
     Args:
@@ -134,6 +136,7 @@ def prepare_job(
         out: its folder.
         options: on top of the job's settings.
         check: raises for what the command could not use; what cannot be used leaves no ``job.yaml`` behind.
+        reporter: told, before anything is spent, of what changes in a job that is there.
 
     Raises:
         AnimaticError: settings, tables, videos, a part or a folder that cannot be used.
@@ -142,6 +145,8 @@ def prepare_job(
         parse_part(options.part)
     _refuse_file(out)
     sources = find_videos(videos, out=out) if videos else []
+    if sources:
+        _refuse_other_folder(out)
     job = open_or_create(out, videos=sources, models_dir=options.models, leave_out=options.leave_out)
     config = configured(job.config, options)
     _check_tables(config, list(job.sources))
@@ -149,6 +154,8 @@ def prepare_job(
     check_models_folder(options.models)
     if check is not None:
         check(job)
+    if reporter is not None and (out / JOB_FILE).is_file() and (words := job_changes(open_job(out), job)):
+        reporter.console.print(f"[bold]{'job':>10}[/] {escape(f'{out}: {words}')}")
     make_folder(out)
     job.save()
     return job
@@ -159,6 +166,15 @@ def _refuse_file(out: Path) -> None:
     there = next((place for place in (out, *out.parents) if place.exists()), None)
     if there is not None and not there.is_dir():
         raise ConfigError(f"--out {out}: {there} is a file; give a folder that can be written to")
+
+
+def _refuse_other_folder(out: Path) -> None:
+    """A folder of other things (the videos, as a rule) is not to be filled with a job's."""
+    if out.is_dir() and not (out / JOB_FILE).is_file():
+        # What another part is just writing begins with a dot.
+        others = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
+        if others:
+            raise ConfigError(f"--out {out}: is no job and not empty (holds {others[0]}); give a job or a new folder")
 
 
 def _check_tables(config: Config, video_ids: Sequence[str]) -> None:
@@ -182,24 +198,31 @@ def configured(config: Config, options: JobOptions) -> Config:
         if options.effort not in EFFORTS:
             raise ConfigError(f"--effort {options.effort!r} is not known; choose one of {', '.join(EFFORTS)}")
         config = with_effort(config, next(effort for effort in EFFORTS if effort == options.effort))
-    changes: dict[str, Any] = {}
-    if options.keep_share is not None:
-        changes["select"] = {"keep_share": options.keep_share}
-    if options.split is not None:
-        changes.setdefault("select", {})["split"] = read_split(options.split)
-    if options.cameras is not None:
-        changes["cameras"] = read_cameras(options.cameras)
-    if options.extractors is not None:
-        names = [name.strip() for name in options.extractors.split(",") if name.strip()]
-        changes["keypoints"] = {"extractors": names}
-    if options.videos is not None:
-        changes["pack"] = {"videos": options.videos}
-    if options.captions is not None:
-        changes["views"] = {"captions": str(absolute(options.captions))}
-    config = merged(config, changes) if changes else config
+    for option, changes in _option_changes(options):
+        try:
+            config = merged(config, changes)
+        except ConfigError as error:
+            raise ConfigError(f"{option}: {str(error).removeprefix('settings: ')}") from error
     if config.views.captions is not None:
         read_caption_table(Path(config.views.captions))
     return config
+
+
+def _option_changes(options: JobOptions) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Each option that stands for a setting, as it was typed, with what it changes."""
+    if options.keep_share is not None:
+        yield f"--keep-share {options.keep_share:g}", {"select": {"keep_share": options.keep_share}}
+    if options.split is not None:
+        yield f"--split {options.split}", {"select": {"split": read_split(options.split)}}
+    if options.cameras is not None:
+        yield f"--cameras {options.cameras}", {"cameras": read_cameras(options.cameras)}
+    if options.extractors is not None:
+        names = [name.strip() for name in options.extractors.split(",") if name.strip()]
+        yield f"--extractors {options.extractors}", {"keypoints": {"extractors": names}}
+    if options.videos is not None:
+        yield f"--videos {options.videos}", {"pack": {"videos": options.videos}}
+    if options.captions is not None:
+        yield f"--captions {options.captions}", {"views": {"captions": str(absolute(options.captions))}}
 
 
 def check_extractors(job: Job, reporter: ConsoleReporter) -> None:
@@ -254,6 +277,8 @@ def _finish(job: Job, reports: Sequence[StageReport], reporter: ConsoleReporter)
     stages = {report.stage for report in reports}
     if stages & {"index", "cut"}:
         print_damaged(damaged_videos(job), reporter.console)
+    if "select" in stages and (job.root / SELECTION).is_file():
+        print_twins(read_selection(job.root / SELECTION), reporter.console)
     if _is_empty(job, stages):
         reporter.console.print(f"[red]{escape(why_nothing_is_left(job.root))}[/]")
         return 1

@@ -33,15 +33,15 @@ class CameraSettings(Settings):
     """What is known of a camera, in pixels of the source. What is not said is read from the file's metadata, else
     estimated from the video, else assumed."""
 
-    fx: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    fy: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    fx: float | None = Field(default=None, ge=1, le=1e6, allow_inf_nan=False)
+    fy: float | None = Field(default=None, ge=1, le=1e6, allow_inf_nan=False)
     """By default as ``fx``."""
-    cx: float | None = Field(default=None, allow_inf_nan=False)
+    cx: float | None = Field(default=None, ge=-1e5, le=1e5, allow_inf_nan=False)
     """By default the picture's middle, as ``cy``."""
-    cy: float | None = Field(default=None, allow_inf_nan=False)
+    cy: float | None = Field(default=None, ge=-1e5, le=1e5, allow_inf_nan=False)
     focal_sigma: float = Field(default=0.01, ge=0, lt=1)
     """One sigma of the focal length, relative to it."""
-    height_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    height_m: float | None = Field(default=None, ge=0.01, le=1000, allow_inf_nan=False)
     """Over the road; metric scale is proportional to it."""
     pitch_deg: float | None = Field(default=None, gt=-45, lt=45)
     """Against the road, positive looks down."""
@@ -105,7 +105,7 @@ class KeypointSettings(Settings):
 class EgoStageSettings(Settings):
     """How the camera's motion is estimated."""
 
-    camera_height_m: float = Field(default=1.5, gt=0, allow_inf_nan=False)
+    camera_height_m: float = Field(default=1.5, ge=0.01, le=1000, allow_inf_nan=False)
     """Assumed of cameras of which no height is given."""
     motion: EgoSettings = EgoSettings()
 

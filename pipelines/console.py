@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from dataset.receipts import Receipt, reason_counts
+from dataset.selection import Selection, twin_holders
 from pipelines.label import StageReport
 
 
@@ -117,6 +118,16 @@ def print_damaged(lines: Sequence[str], console: Console, *, most: int = 3) -> N
     """Which videos are damaged, and how; of many, the first ``most``."""
     for line in shortened(lines, most):
         console.print(f"[yellow]damaged[/] {escape(line)}")
+
+
+def print_twins(selection: Selection, console: Console, *, most: int = 3) -> None:
+    """Which videos are dropped because others have the same bytes; of many, the first ``most``."""
+    lines = [
+        f"{name} is {holder} again, byte for byte: its clips are dropped (same_as)"
+        for name, holder in sorted(twin_holders(selection).items())
+    ]
+    for line in shortened(lines, most):
+        console.print(f"[yellow]note[/] {escape(line)}")
 
 
 def print_failures(failed: Sequence[Receipt], console: Console, *, most: int = 20) -> None:

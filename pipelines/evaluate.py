@@ -18,6 +18,7 @@ import numpy as np
 from dataset.loader import Sample, ShardDataset
 from dataset.receipts import atomic_write, digest, make_folder, sha256_file, storage_errors, try_folder
 from labeling.camera import read_tum, resample
+from labeling.errors import DataError
 from labeling.extractors import Extractors, choose_extractors
 from pipelines.engine import minding_workers
 from pipelines.evaluate_notes import clip_notes, record_notes, result_notes, ruler_notes
@@ -101,7 +102,11 @@ def evaluate(
     datasets = [ShardDataset(job, split) for split in ("val", "train")]
     clips = {sample.key: sample for dataset in datasets for sample in dataset}
     splits = {key: dataset.split for dataset in datasets for key in dataset.keys}
-    folders = _folders(samples, clips, options)
+    try:
+        folders = _folders(samples, clips, options)
+    except DataError as error:
+        count = ", ".join(f"{len(dataset)} {dataset.split}" for dataset in datasets)
+        raise DataError(f"{error} (of {count} clips; `animatic inspect {job} --keys` lists them)") from error
     ruler = read_ruler(job, options)
     keys = [key for key in clips if key in folders[SAMPLES].by_key]
     out = options.out or samples / "evaluation"

@@ -17,7 +17,7 @@ def export_released(job: Path, out: Path, *, split: str = "train") -> int:
     ``pose_path`` is the released name of the skeleton video. Files that are there with the right bytes stay.
 
     Raises:
-        ConfigError: a split that is not known, or has no clips.
+        ConfigError: a split that is not known, or has no clips, or ``out`` is the job's own folder.
         DataError: the job is not packed, or was packed without views.
         StorageError: no space left, or ``out`` cannot be written to.
     """
@@ -26,13 +26,23 @@ def export_released(job: Path, out: Path, *, split: str = "train") -> int:
     dataset = ShardDataset(job, split)
     if not len(dataset):
         raise ConfigError(f"{job}: its {split} split is empty; export the other, or label more source videos")
+    refuse_job_folder(job, out)
     out = absolute(out)
     lines = [json.dumps(_export_clip(sample, out)) for sample in dataset]
     manifest = out / f"{split}.jsonl"
     atomic_write(manifest, ("\n".join(lines) + "\n").encode())
     print_black_skeletons(job, make_console())
     make_console().print(f"{counted(len(lines), 'clip')} in {manifest}")
+    other = "val" if split == "train" else "train"
+    if left := len(ShardDataset(job, other)):
+        make_console().print(f"{counted(left, 'clip')} of {other} {'is' if left == 1 else 'are'} left: --split {other}")
     return 0
+
+
+def refuse_job_folder(job: Path, out: Path) -> None:
+    """Raise ``ConfigError`` where an export would be strewn among a job's own files."""
+    if out.resolve() == job.resolve():
+        raise ConfigError(f"--out {out}: is the job's own folder; give another, such as {out / 'export'}")
 
 
 def _export_clip(sample: Sample, out: Path) -> dict[str, str]:

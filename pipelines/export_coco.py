@@ -24,6 +24,7 @@ from labeling.timeline import FPS, Span
 from labeling.video import read_frames
 from pipelines.black_skeletons import print_black_skeletons
 from pipelines.console import counted, make_console
+from pipelines.export import refuse_job_folder
 from pipelines.job import Job, open_job
 from pipelines.stages_source import job_selection
 
@@ -33,6 +34,7 @@ COCO_IDS = {"coco17": 1, "wholebody133": 2, "openpose18": 3, "car66": 4, "car24"
 VISIBLE_SCORE = DEFAULT_STYLE.min_score
 """Points scored below are labelled but not visible: what the skeleton video does not draw."""
 
+SPLITS = ("train", "val")
 _JPEG_QUALITY = 95
 
 
@@ -60,23 +62,35 @@ class CocoRun:
         return f"images/{self.name}/{frame:08d}.jpg"
 
 
-def export_coco(job_folder: Path, out: Path, *, split: str = "train", images: bool = False) -> int:
-    """Write ``<split>.coco.json``, and with ``images`` the frames that it names as JPEG files.
+def export_coco(job_folder: Path, out: Path, *, split: str | None = None, images: bool = False) -> int:
+    """Write ``<split>.coco.json`` for each split that has labelled runs, or for the one that is named; with ``images``
+    the frames that it names as JPEG files too.
 
     Raises:
-        ConfigError: no job, a split that is not known, or one without labelled runs.
+        ConfigError: no job, a split that is not known, none with labelled runs, or ``out`` is the job's own folder.
         NotReadyError: the job's clips are not selected yet.
         StorageError: no space left, or ``out`` cannot be written to.
     """
-    if split not in ("train", "val"):
-        raise ConfigError(f"--split {split!r} is not known; choose train or val")
+    if split not in (None, *SPLITS):
+        raise ConfigError(f"--split {split!r} is not known; choose train or val, or leave it out for both")
     job = open_job(job_folder)
-    runs = plan_runs_of(job, split)
-    if not runs:
+    refuse_job_folder(job_folder, out)
+    wanted = SPLITS if split is None else (split,)
+    planned = {name: runs for name in wanted if (runs := plan_runs_of(job, name))}
+    if not planned:
+        what = f"its {split} split has" if split else "it has"
+        other = "export the other split, " if split else ""
         raise ConfigError(
-            f"{job_folder}: its {split} split has no labelled run; run `animatic label --out {job_folder}`, export the "
-            "other split, or label more source videos"
+            f"{job_folder}: {what} no labelled run; run `animatic label --out {job_folder}`, {other}or label more "
+            "source videos"
         )
+    print_black_skeletons(job_folder, make_console())
+    for name, runs in planned.items():
+        _export_split(job, out, name, runs, images=images)
+    return 0
+
+
+def _export_split(job: Job, out: Path, split: str, runs: list[CocoRun], *, images: bool) -> None:
     picture = job.config.picture
     table = out / f"{split}.coco.json"
     chunks = coco_chunks(
@@ -88,9 +102,7 @@ def export_coco(job_folder: Path, out: Path, *, split: str = "train", images: bo
             _write_images(job.root, run, out)
     count = counted(sum(len(run.frames) for run in runs), "image")
     pictures = f"their pictures in {out / 'images'}" if images else "without their pictures: --images writes them too"
-    print_black_skeletons(job_folder, make_console())
     make_console().print(f"{count} of {counted(len(runs), 'run')} in {table}, {pictures}")
-    return 0
 
 
 def plan_runs_of(job: Job, split: str) -> list[CocoRun]:

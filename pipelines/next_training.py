@@ -13,6 +13,7 @@ from training.adapter_notes import adapter_file, read_progress
 from training.config import BACKBONES, config_names
 
 _ADAPTERS = ("motion", "appearance")
+_NOT_HERE = "its weights are not on this machine, `--backbone tiny` tries all steps without any; "
 
 
 def next_training(root: Path) -> tuple[str, str]:
@@ -23,10 +24,21 @@ def next_training(root: Path) -> tuple[str, str]:
         others = ", ".join(name for name in BACKBONES if name != "ltx-2b")
         return (
             f"animatic cache {root} --backbone ltx-2b",
-            f"{counted(len(keys), 'clip')} packed, which `animatic inspect {root}` shows; other backbones: {others}",
+            f"{counted(len(keys), 'clip')} packed, which `animatic inspect {root}` shows; "
+            f"{'' if _weights_are_here('ltx-2b') else _NOT_HERE}other backbones: {others}",
         )
     # Of several backbones the one that has come furthest.
     return max((_next_of(root, store, keys) for store in stores), key=lambda step: step[0])[1:]
+
+
+def _weights_are_here(backbone: str) -> bool:
+    """Whether the hub's cache holds a preset's weights, or some of them."""
+    try:
+        from huggingface_hub import constants
+    except ImportError:  # a base install labels, and trains nothing
+        return False
+    name = f"models--{BACKBONES[backbone]['weights'].replace('/', '--')}"
+    return any((Path(constants.HF_HUB_CACHE) / name / "snapshots").glob("*/*"))
 
 
 def _next_of(root: Path, store: Path, keys: set[str]) -> tuple[int, str, str]:

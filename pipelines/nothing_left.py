@@ -19,6 +19,7 @@ _ADVICE = {
     "left_out": "leave out less with --leave-out",
     "objects": "keep more with --keep-share, or judge anew with `animatic select --refreeze`",
     "sample": "take more with select.sample_clips in --config, or judge anew with `animatic select --refreeze`",
+    "same_as": "give each video once",
     "uncounted": "get the files again",
     "no_trajectory": "import trajectories that cover the videos",
 }

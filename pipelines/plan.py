@@ -52,6 +52,10 @@ class JobPlan:
     """Videos that cannot be opened, with the reason."""
     damaged: tuple[str, ...]
     """Videos that are less than they claim, as far as is known: files cut off, and those that were measured on."""
+    too_short: int
+    """Videos that are shorter than a clip, less what is left out of them."""
+    clip_frames: int
+    """Of one clip."""
     source_hours: float
     clips: int
     """Candidates: all that fit on the videos' timelines; of the videos that were measured on, those without a hole."""
@@ -108,7 +112,11 @@ def plan_job(
     candidates = {name: count_candidates(length, config.clip) for name, length in lengths.items()}
     usable = [source for source in sources if candidates.get(source.video_id)]
     if not usable:
-        raise ConfigError(f"none of {len(sources)} videos is long enough for one clip of {_clip_s(config.clip):g} s")
+        raise ConfigError(
+            f"none of {len(sources)} videos is long enough for one clip of {config.clip.clip_frames} frames "
+            f"({_clip_s(config.clip):g} s); give longer videos, or a smaller clip.clip_frames with --config"
+        )
+    too_short = len(lengths) - len(usable)
     clips_of = functools.cache(functools.partial(read_clips, clip=config.clip))
     receipts = _calibrate(usable, clips_of, config, options.models, seconds=calibration_s)
     measured = _Measured.of(receipts)
@@ -121,7 +129,9 @@ def plan_job(
     looked = {name: receipt.facts for name, receipt in receipts["index"].items()}
     damaged = damage_lines(cut_off | looked, receipts["cut"].values())
     return JobPlan(
-        videos=len(lengths), broken=broken, damaged=tuple(damaged), source_hours=sum(lengths.values()) / 3600,
+        videos=len(lengths), broken=broken, damaged=tuple(damaged),
+        too_short=too_short, clip_frames=config.clip.clip_frames,
+        source_hours=sum(lengths.values()) / 3600,
         clips=total, kept_clips=kept, sampled_clips=sampled, clip_hours=sampled * _clip_s(config.clip) / 3600,
         stages=_scaled(receipts, measured, lengths, candidates=candidates, sampled=sampled),
         calibration_s=measured.window_s, calibration_clips=measured.kept_clips,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from rich.markup import escape
 from rich.table import Table
 
 from pipelines.commands import JobOptions
@@ -27,8 +28,14 @@ def show_plan(videos: Sequence[Path], options: JobOptions, *, parts: int, as_jso
         return 0
     console = make_console()
     for reason in plan.broken:
-        console.print(f"[red]left out[/] {reason}")
+        console.print(f"[red]left out[/] {escape(reason)}")
     print_damaged(plan.damaged, console)
+    if plan.too_short:
+        verb = "is" if plan.too_short == 1 else "are"
+        console.print(
+            f"[yellow]note[/] {plan.too_short} of {counted(plan.videos, 'video')} {verb} shorter than a clip "
+            f"({plan.clip_frames} frames)"
+        )
     console.print(
         f"{counted(plan.videos, 'video')}, {hours(plan.source_hours)} of footage; {counted(plan.clips, 'clip')}, "
         f"{plan.kept_clips} kept, {plan.sampled_clips} taken ({hours(plan.clip_hours)})"

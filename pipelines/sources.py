@@ -4,14 +4,16 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dataset.layout import JOB_FILE
-from labeling.errors import ConfigError
+from labeling.errors import AnimaticError, ConfigError
 from labeling.timeline import LONGEST_VIDEO_ID, check_video_id
 from pipelines.given_tables import read_leave_out, two_lengths
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v", ".ts", ".mts", ".mpg", ".mpeg", ".flv"})
+_OTHER_FOLDER = "give the folder of the videos, and --out another one (a job that is there goes on without any VIDEO)"
+_MOST_NAMED = 8
 _LIST_SUFFIXES = frozenset({".txt", ".lst", ".list", ".tsv"})
 
 
@@ -75,19 +77,21 @@ def find_videos(arguments: Sequence[Path], *, out: Path | None = None) -> list[S
     made is no source: below a folder, ``out`` and every folder that holds a ``job.yaml`` are left out.
 
     Raises:
-        ConfigError: nothing there, an id that cannot be used, two videos with one id, or none of them exists.
+        ConfigError: nothing there, ids that cannot be used, two videos with one id, a video that lies in ``out``, or
+            none of them exists.
     """
     found = [entry for argument in arguments for entry in _expand(argument, out)]
+    _check_ids(found)
     sources: dict[str, Source] = {}
-    for video_id, path in found:
-        _check_id(video_id, path)
+    for video_id, path, place in found:
+        if out is not None and out.resolve() in (path.parent.resolve(), *path.parent.resolve().parents):
+            raise ConfigError(f"{place}: lies in the job's own folder {out}; {_OTHER_FOLDER}")
         old = sources.get(video_id)
         if old is not None and old.path != path:
             raise ConfigError(same_id(video_id, old.path, path))
         sources[video_id] = Source(video_id=video_id, path=path)
     if sources and not any(source.path.exists() for source in sources.values()):
-        missing = next(iter(sources.values())).path
-        raise ConfigError(f"{missing}: no such file; check the path")
+        raise ConfigError(f"{found[0].place}: no such file; check the path")
     return list(sources.values())
 
 
@@ -118,31 +122,48 @@ def absolute(path: Path) -> Path:
     return Path(os.path.normpath(path.absolute()))
 
 
-def _check_id(video_id: str, path: Path) -> None:
-    """Raise ``ConfigError`` unless a video's id can be part of a clip's key."""
+class _Named(NamedTuple):
+    """A video as a person named it."""
+
+    video_id: str
+    path: Path
+    place: str
+    """What to call it in an error: its path, after the list and the line that name it."""
+
+
+def _check_ids(found: Sequence[_Named]) -> None:
+    """Raise ``ConfigError``, once for all, unless every video's id can be part of a clip's key."""
+    wrong = [f"{named.place}: {named.video_id!r}" for named in found if not _is_id(named.video_id)]
+    if wrong:
+        rule = f"is no video id (at most {LONGEST_VIDEO_ID} letters, digits, - and _)"
+        others = ", ".join(wrong[1:_MOST_NAMED]) + (
+            f" and {len(wrong) - _MOST_NAMED} more" * (len(wrong) > _MOST_NAMED)
+        )
+        raise ConfigError(
+            f"{wrong[0]} {rule}{f', nor are {others}' if others else ''}; rename the file{'s' * (len(wrong) > 1)}, or "
+            "give a text file of lines `id<TAB>path` in their place"
+        )
+
+
+def _is_id(video_id: str) -> bool:
     try:
         check_video_id(video_id)
-    except Exception as error:
-        raise ConfigError(
-            f"{path}: {video_id!r} is no video id (at most {LONGEST_VIDEO_ID} letters, digits, - and _); rename the "
-            "file, or give a text file of lines `id<TAB>path` in its place"
-        ) from error
+    except AnimaticError:
+        return False
+    return True
 
 
-def _expand(argument: Path, out: Path | None) -> list[tuple[str, Path]]:
+def _expand(argument: Path, out: Path | None) -> list[_Named]:
     if argument.is_dir():
         if _is_job(argument, out):
-            raise ConfigError(
-                f"{argument}: is a job's own folder; give the folder of the videos, and --out another one (a job that "
-                "is there goes on without any VIDEO)"
-            )
+            raise ConfigError(f"{argument}: is a job's own folder; {_OTHER_FOLDER}")
         files = sorted(_files_below(argument, out))
         if not files:
             raise ConfigError(f"{argument}: holds no videos ({', '.join(sorted(VIDEO_SUFFIXES))}); check the path")
-        return [(path.stem, absolute(path)) for path in files]
+        return [_Named(path.stem, absolute(path), str(path)) for path in files]
     if argument.suffix.lower() in _LIST_SUFFIXES and argument.is_file():
         return _read_list(argument)
-    return [(argument.stem, absolute(argument))]
+    return [_Named(argument.stem, absolute(argument), str(argument))]
 
 
 def _files_below(folder: Path, out: Path | None) -> Iterator[Path]:
@@ -161,18 +182,21 @@ def _is_job(folder: Path, out: Path | None) -> bool:
     return (folder / JOB_FILE).is_file() or (out is not None and folder.resolve() == out.resolve())
 
 
-def _read_list(path: Path) -> list[tuple[str, Path]]:
+def _read_list(path: Path) -> list[_Named]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read as a list of videos ({error}); give a path on each line") from error
     entries = []
-    for line in lines:
+    for number, line in enumerate(lines, start=1):
         video_id, tab, name = line.strip().rpartition("\t")
         if not name.strip() or line.lstrip().startswith("#"):
             continue
         video = absolute(path.parent / name.strip())
-        entries.append((video_id.strip() if tab else video.stem, video))
+        place = f"{path}: line {number}: {video}"
+        if "\0" in name or video.is_dir():
+            raise ConfigError(f"{place}: is no file's path; give one on each line, with `id<TAB>` before it if wanted")
+        entries.append(_Named(video_id.strip() if tab else video.stem, video, place))
     if not entries:
         raise ConfigError(f"{path}: lists no videos; give a path on each line")
     return entries

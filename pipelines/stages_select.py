@@ -1,6 +1,6 @@
 """Counting objects on keyframes, and the one barrier: which clips are kept."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +166,8 @@ class SelectStage:
             for video_id in index
             if every or video_id in counts
         }
+        for video_id, same in _twins(job, videos).items():
+            videos[video_id]["twins"] = same
         settings = {
             "select": job.config.select.model_dump(mode="json"),
             "clip": job.config.clip.model_dump(mode="json", exclude={"run_frames"}),
@@ -198,6 +200,7 @@ class SelectStage:
         selection = select_clips(
             candidates, rule, digests={video_id: digest(facts) for video_id, facts in videos.items()},
             rule_digest=_rule_digest(item), previous=_previous(root), mode=item.payload["mode"],
+            twins={video_id: facts["twins"] for video_id, facts in videos.items() if "twins" in facts},
         )  # fmt: skip
         write_selection(staging / SELECTION, selection)
         return {
@@ -228,6 +231,15 @@ def clip_plan(index: VideoIndex, clip: ClipSettings, leave_out_s: tuple[float, f
     timeline = plan_timeline(index.times_s)
     plan = plan_clips(timeline, clip_frames=clip.clip_frames, stride_frames=clip.stride_frames, leave_out_s=leave_out_s)
     return timeline, plan
+
+
+def _twins(job: Job, video_ids: Collection[str]) -> dict[str, list[str]]:
+    """By video id, all ids of files with the same bytes, of those that have any."""
+    alike: dict[str, list[str]] = {}
+    for video_id, receipt in job.done("source").items():
+        if video_id in video_ids:
+            alike.setdefault(receipt.facts["sha256"], []).append(video_id)
+    return {video_id: same for same in alike.values() if len(same) > 1 for video_id in same}
 
 
 def _counting(job: Job) -> dict[str, Any]:

@@ -10,20 +10,20 @@ from rich.markup import escape
 from rich.table import Table
 
 from dataset.contact_sheet import contact_sheet
-from dataset.inspection import Spread, Summary, clip_record, drop_reasons, find_sample, summarize
+from dataset.inspection import Spread, Summary, clip_record, drop_reasons, find_sample, packed_keys, summarize
 from dataset.layout import JOB_FILE, SELECTION, SHARD_INDEX
-from dataset.loader import ShardDataset
 from dataset.pictures import write_picture
 from dataset.receipts import read_receipts, reason_counts
 from dataset.selection import read_selection
 from labeling.errors import AnimaticError, ConfigError, DataError
-from pipelines.black_skeletons import print_black_skeletons
+from pipelines.black_skeletons import black_skeletons, print_black_skeletons
 from pipelines.console import counted, dropped_words, file_size, make_console, print_damaged, shortened
 from pipelines.damage import damaged_videos
 from pipelines.job import Job, open_job
 from pipelines.next_training import next_training
 from pipelines.nothing_left import clips_packed, why_nothing_is_left
 from pipelines.stage import COMMAND_STAGES, item_state
+from pipelines.stale_shards import print_stale_shards
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +71,7 @@ def job_status(root: Path) -> JobStatus:
     job = open_job(root)
     stages = tuple(stage_status(job, name) for names in COMMAND_STAGES.values() for name in names)
     empty = why_nothing_is_left(root) if _is_through(stages) and clips_packed(job) == 0 else ""
-    command, reason = _next(root, stages, empty=bool(empty))
+    command, reason = _next(job, stages, empty=bool(empty))
     return JobStatus(
         root=str(root), videos=len(job.sources), stages=stages, clips=_selected(root),
         damaged=tuple(damaged_videos(job)), nothing_left=empty, next_command=command, next_reason=reason,
@@ -109,8 +109,9 @@ def _is_through(stages: tuple[StageStatus, ...]) -> bool:
     return not any(stage.items is None or stage.pending or stage.retryable for stage in stages)
 
 
-def _next(root: Path, stages: tuple[StageStatus, ...], *, empty: bool) -> tuple[str, str]:
+def _next(job: Job, stages: tuple[StageStatus, ...], *, empty: bool) -> tuple[str, str]:
     """What to type next, and why."""
+    root = job.root
     again = f"animatic label --out {root}"
     for stage in stages:
         if stage.retryable:
@@ -122,6 +123,9 @@ def _next(root: Path, stages: tuple[StageStatus, ...], *, empty: bool) -> tuple[
     if empty:
         return again, "with other settings or videos: no clip is left"
     if stages[-1].done and (root / SHARD_INDEX).is_file():
+        # A person who has cached latents all the same may have other control videos.
+        if black_skeletons(job) and not any((root / "latents").glob("*/cache.json")):
+            return "animatic models", f"to get a keypoint network: without one skeletons are black; then `{again}`"
         return next_training(root)
     return again, "nothing is packed yet"
 
@@ -185,13 +189,25 @@ def failure_lines(root: Path, *, most: int = 20) -> list[str]:
 
 
 def inspect(
-    root: Path, key: str | None, *, sheet: Path | None = None, trajectory: Path | None = None, as_json: bool = False
-) -> int:
-    """The dataset's summary, or a clip's record, contact sheet and trajectory.
+    root: Path, key: str | None, *, sheet: Path | None = None, trajectory: Path | None = None, as_json: bool = False,
+    keys: bool = False,
+) -> int:  # fmt: skip
+    """The dataset's summary, a clip's record, contact sheet and trajectory, or the packed clips' keys.
 
     Raises:
         AnimaticError: no job, no such clip, a clip that was dropped, or a picture that cannot be written.
     """
+    if keys:
+        if key is not None or sheet is not None or trajectory is not None:
+            raise ConfigError("--keys lists all packed clips; give it without a clip and without pictures")
+        by_split = packed_keys(root)
+        if as_json:
+            print_json(by_split)
+            return 0
+        for split, packed in by_split.items():
+            for one in packed:
+                print(f"{one}\t{split}")
+        return 0
     if key is None:
         if sheet is not None or trajectory is not None:
             option = "--sheet" if sheet is not None else "--trajectory"
@@ -219,7 +235,7 @@ def inspect(
 
 
 def _some_key(root: Path) -> str:
-    keys = [key for split in ("train", "val") for key in ShardDataset(root, split).keys]
+    keys = [key for packed in packed_keys(root).values() for key in packed]
     return keys[0] if keys else "<video_id>_<start_frame>"
 
 
@@ -252,6 +268,7 @@ def _print_summary(root: Path, summary: Summary) -> None:
     if (root / JOB_FILE).is_file():
         print_damaged(damaged_videos(open_job(root)), console)
     print_black_skeletons(root, console)
+    print_stale_shards(root, console)
     if sum(summary.packed.values()):
         console.print(f"one clip: [bold]animatic inspect {root} {_some_key(root)} --sheet sheet.png[/]")
     elif not summary.kept or (root / SHARD_INDEX).is_file():

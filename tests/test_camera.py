@@ -101,6 +101,16 @@ def test_resample_hits_the_samples_and_halves_between() -> None:
         resample(whole, np.array([0.0, 99.0]))
 
 
+@pytest.mark.parametrize("far", [1e9, 1e200, -1e200])
+def test_positions_that_are_on_no_road_are_refused(tmp_path: Path, far: float) -> None:
+    (tmp_path / "a.tum").write_text(f"0 0 0 0 0 0 0 1\n1 0 {far} 0 0 0 0 1\n")
+    (tmp_path / "a.txt").write_text(f"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1 {far}\n")
+    with pytest.raises(TrajectoryError, match="row 1 lies .* m from the origin; give metres"):
+        read_tum(tmp_path / "a.tum")
+    with pytest.raises(TrajectoryError, match="row 1 lies"):
+        read_kitti(tmp_path / "a.txt", fps=24)
+
+
 def test_tum_and_kitti_files_round_trip(tmp_path: Path) -> None:
     whole = random_trajectory()
     write_tum(whole, tmp_path / "a.tum")

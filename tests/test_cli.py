@@ -16,6 +16,7 @@ from pipeline_fixtures import SMALL, write_detector, write_street
 from safetensors.numpy import save_file
 
 from pipelines.cli import main
+from pipelines.next_training import next_training
 from training.adapter_notes import OUR_METADATA
 
 
@@ -91,11 +92,22 @@ def test_python_runs_the_modules_as_the_command(module):
 
 def test_status_of_a_finished_job(run, job):
     code, out, _ = run("status", job)
-    assert code == 0 and f"next: animatic cache {job} --backbone ltx-2b  (2 clips packed, which `animatic insp" in out
+    assert code == 0 and "next: animatic models  (to get a keypoint network: without one skeletons are black" in out
     assert f"{job}: 1 video\n" in out and "clips: 2 kept\n" in out
     code, out, _ = run("status", job, "--json")
     stages = {stage["stage"]: stage for stage in json.loads(out)["stages"]}
     assert stages["cut"]["done"] == 1 and stages["render"]["done"] == 2 and not stages["pack"]["failed"]
+
+
+def test_a_backbone_that_needs_no_weights_is_named_where_those_of_the_first_are_not_there(job, tmp_path, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    command, reason = next_training(job)
+    assert command == f"animatic cache {job} --backbone ltx-2b" and reason.startswith("2 clips packed, which `animatic")
+    assert "`--backbone tiny` tries all steps without any" in reason
+    weights = tmp_path / "models--Lightricks--LTX-Video" / "snapshots" / "0" / "model_index.json"
+    weights.parent.mkdir(parents=True)
+    weights.touch()
+    assert "`--backbone tiny`" not in next_training(job)[1]
 
 
 def test_status_goes_on_to_training(run, job, tmp_path):
@@ -164,6 +176,31 @@ def test_a_finished_job_is_labelled_again_at_once(run, job):
     assert code == 0 and not re.search(r"[1-9]\d* done", out)
 
 
+def test_what_changes_in_a_job_is_said_before_work_starts(run, video, job, tmp_path):
+    root = shutil.copytree(job, tmp_path / "J")
+    more = write_street(tmp_path / "more.mp4", frames=24, seed=3)
+    code, out, _ = run("index", more, "--out", root, "--keep-share", "0.9", "--extractors", "street", "--workers", "0")
+    words = (
+        f"{root}: adds 1 video to 1; select.keep_share 1.0 -> 0.9, keypoints.extractors none -> street: what depends "
+    )
+    assert code == 0 and words in out.splitlines()[0]
+    stale = "note shards are older than the job's settings, videos or models"
+    assert stale in run("inspect", root)[1] and stale not in run("inspect", job)[1]
+    assert stale in run("cache", root, "--backbone", "nope")[1]
+    assert stale in run("train", "motion", "--data", root, "--config", "motion_ltx_2b", "--dry-run")[1]
+    assert (
+        "effort balanced -> fast: what depends on it" in run("index", "-o", root, "--config", fast(tmp_path, root))[1]
+    )
+    assert "adds" not in run("index", "-o", root)[1]
+
+
+def fast(folder, job):
+    """The settings of a job with another effort."""
+    config = yaml.safe_load((job / "job.yaml").read_text())["config"]
+    changed = {"keypoints": {**config["keypoints"], "effort": "fast"}, "count": {"looks_per_clip": 1}}
+    return bad_yaml(folder, yaml.safe_dump(config | changed))
+
+
 def test_inspect_gives_a_summary_a_record_and_a_sheet(run, job, tmp_path):
     code, out, _ = run("inspect", job)
     assert code == 0 and "2, kept 2 (no threshold), packed 2" in out and "1 video, " in out
@@ -175,6 +212,9 @@ def test_inspect_gives_a_summary_a_record_and_a_sheet(run, job, tmp_path):
     assert sheet is not None and sheet.shape[1] > 2000
     code, out, _ = run("inspect", job, "street_8", "--trajectory", tmp_path / "t.png")
     assert code == 0 and "trajectory:" in out and (tmp_path / "t.png").is_file()
+    assert run("inspect", job, "--keys") == (0, "street_0\ttrain\nstreet_8\ttrain\n", "")
+    assert json.loads(run("inspect", job, "--keys", "--json")[1]) == {"train": ["street_0", "street_8"], "val": []}
+    assert run("inspect", job, "street_8", "--keys")[0] == 2
     assert json.loads(run("inspect", job, "--json")[1])["packed"] == {"train": 2, "val": 0}
 
 
@@ -196,6 +236,10 @@ def test_the_released_trainer_s_manifest(run, job, tmp_path):
     assert all(set(line) == {"id", "caption", "rgb_path", "pose_path"} for line in lines)
     assert {frame_count(line[name]) for line in lines for name in ("rgb_path", "pose_path")} == {9}
     assert run("export", "released", job, "--out", tmp_path, "--split", "val")[0] == 2
+    for form in ("released", "coco"):
+        code, _, err = run("export", form, job, "--out", job / "videos" / "..")
+        assert code == 2 and "is the job's own folder; give another" in err
+    assert not list(job.glob("*.json*")) and not (job / "rgb").exists()
 
 
 def test_keypoints_as_coco(run, job, tmp_path):
@@ -419,10 +463,10 @@ def test_a_list_of_paths_with_ids(run, video, config, tmp_path):
     listed.write_text(f"# two of them\nmine\t{video}\n\n{video}\n")
     table = tmp_path / "leave.csv"
     table.write_text("video_id,start_s,end_s\nmine,0.2,\n")
-    code, _, _ = run(
+    code, out, _ = run(
         "label", listed, "-o", tmp_path / "J", "--config", config, "--keep-share", "1", "--workers", "0",
         "--leave-out", table,
     )  # fmt: skip
-    assert code == 0
+    assert code == 0 and "note street is mine again, byte for byte: its clips are dropped (same_as)" in out
     summary = json.loads(run("inspect", tmp_path / "J", "--json")[1])
-    assert (summary["videos"], summary["kept"], summary["dropped"]) == (2, 3, {"left_out": 1})
+    assert (summary["videos"], summary["kept"], summary["dropped"]) == (2, 1, {"left_out": 1, "same_as": 2})

@@ -121,11 +121,13 @@ def test_a_file_that_breaks_half_way_is_not_left_behind(tmp_path):
 def test_a_job_is_exported_with_its_frames(tmp_path):
     write_street(tmp_path / "street.mp4", frames=24, level=130)
     models = write_detector(tmp_path / "models")
-    sources = find_videos([tmp_path / "street.mp4"])
-    config = small_config(select={"keep_share": 1.0})
+    write_street(tmp_path / "other.mp4", frames=9, level=130, seed=1)
+    sources = find_videos([tmp_path / "street.mp4", tmp_path / "other.mp4"])
+    config = small_config(select={"keep_share": 1.0, "split": {"street": "train", "other": "val"}})
     job = Job(tmp_path / "J", config, {source.video_id: source for source in sources}, models_dir=models)
     run_all(job)
-    assert export_coco(job.root, tmp_path / "out", images=True) == 0
+    assert export_coco(job.root, tmp_path / "out", images=True, split="train") == 0
+    assert not (tmp_path / "out" / "val.coco.json").exists()
     found = json.loads((tmp_path / "out" / "train.coco.json").read_text())
     # Clips of 9 frames, one each 8, share frames: each is one image.
     assert [image["source_frame"] for image in found["images"]] == list(range(17))
@@ -139,8 +141,8 @@ def test_a_job_is_exported_with_its_frames(tmp_path):
     export_coco(job.root, tmp_path / "again")
     assert (tmp_path / "again" / "train.coco.json").read_bytes() == before
     assert not (tmp_path / "again" / "images").exists()
-    with pytest.raises(ConfigError, match="val split has no labelled run"):
-        export_coco(job.root, tmp_path / "out", split="val")
+    val = json.loads((tmp_path / "again" / "val.coco.json").read_text())
+    assert [video["name"] for video in val["videos"]] == ["other/run_0_9"], "without a word both splits are written"
     with pytest.raises(ConfigError, match="choose train or val"):
         export_coco(job.root, tmp_path / "out", split="test")
     with pytest.raises(ConfigError, match=r"holds no job\.yaml"):

@@ -86,7 +86,7 @@ def test_a_clip_that_is_not_packed_says_what_became_of_it(job):
         find_sample(job, "v_16")
     with pytest.raises(DataError, match="v_8: is not in the shards: cut=1 first at"):
         find_sample(job, "v_8")
-    with pytest.raises(DataError, match="has no clip 'x'.*such as v_0, v_8, v_16"):
+    with pytest.raises(DataError, match="has no clip 'x'.*such as v_0$"):
         find_sample(job, "x")
     assert clip_verdict(job, "v_8").kept
 

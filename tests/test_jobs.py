@@ -138,7 +138,8 @@ def test_a_job_inside_the_videos_folder_takes_nothing_of_a_job_for_a_source(tmp_
         made.parent.mkdir(parents=True)
         made.write_bytes(b"x")
     (two_files / "deep" / "d.mp4").write_bytes(b"x")
-    (other / "job.yaml").touch()
+    for made in (root, other):
+        (made / "job.yaml").touch()
     for _ in range(2):
         job = prepare_job([two_files], root, JobOptions())
         assert list(job.sources) == ["a", "b", "d"]
@@ -172,9 +173,56 @@ def test_a_link_to_a_video_that_is_gone_is_told_of(tmp_path, two_files):
 def test_a_job_s_own_folder_is_no_folder_of_videos(tmp_path, two_files):
     with pytest.raises(ConfigError, match="is a job's own folder"):
         prepare_job([two_files], two_files, JobOptions())
-    assert list(prepare_job([two_files], tmp_path, JobOptions()).sources) == ["a", "b"], "videos may lie in the job's"
+    prepare_job([two_files], tmp_path / "J", JobOptions())
     with pytest.raises(ConfigError, match="is a job's own folder"):
-        prepare_job([tmp_path], tmp_path / "another", JobOptions())
+        prepare_job([tmp_path / "J"], tmp_path / "another", JobOptions())
+
+
+@pytest.mark.parametrize("named", ["list", "file", "folder above", "link"])
+def test_a_video_below_the_job_s_folder_is_no_source_of_it(tmp_path, two_files, named):
+    (two_files / "job.yaml").touch()
+    (tmp_path / "list.txt").write_text("v/a.mp4\n")
+    (tmp_path / "link").symlink_to(two_files)
+    given = {"list": tmp_path / "list.txt", "file": two_files / "a.mp4", "folder above": tmp_path / "link" / "a.mp4"}
+    with pytest.raises(ConfigError, match="lies in the job's own folder .*; give the folder of the videos"):
+        prepare_job([given.get(named, two_files / "a.mp4")], given_out(tmp_path, two_files, named), JobOptions())
+
+
+def given_out(tmp_path, two_files, named):
+    """The videos' folder by the name that the videos have, or by that of a link."""
+    return tmp_path / "link" if named in ("link", "folder above") else two_files
+
+
+def test_a_folder_of_other_things_is_filled_with_no_job(tmp_path, two_files):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "notes.txt").touch()
+    with pytest.raises(ConfigError, match=r"thesis: is no job and not empty \(holds notes.txt\); give a job or a new"):
+        prepare_job([two_files], tmp_path / "thesis", JobOptions())
+    assert [path.name for path in (tmp_path / "thesis").iterdir()] == ["notes.txt"]
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / ".job.yaml.host-1.tmp").touch()
+    assert list(prepare_job([two_files], tmp_path / "empty", JobOptions()).sources) == ["a", "b"]
+
+
+def test_all_ids_that_cannot_be_are_named_at_once(tmp_path):
+    for name in ("a.b.mp4", "c d.mp4", "e.mp4"):
+        (tmp_path / name).touch()
+    with pytest.raises(ConfigError, match="a.b.mp4: 'a.b' is no video id .*, nor are .*c d.mp4: 'c d'; rename the fil"):
+        find_videos([tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("x y\ta.mp4", "line 3: .*a.mp4: 'x y' is no video id"),
+        (".", "line 3: .*: is no file's path"),
+        ("gone.mp4", "line 3: .*gone.mp4: no such file"),
+    ],
+)
+def test_a_line_that_cannot_be_used_is_named(tmp_path, line, message):
+    (tmp_path / "list.txt").write_text(f"# a comment\n\n{line}\n")
+    with pytest.raises(ConfigError, match=f"list.txt: {message}"):
+        find_videos([tmp_path / "list.txt"])
 
 
 def test_a_video_by_another_route_is_the_same_video(tmp_path, two_files, monkeypatch):

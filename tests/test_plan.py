@@ -127,6 +127,16 @@ def test_videos_too_short_for_a_clip_are_an_error(tmp_path: Path, options: JobOp
         plan_job([tmp_path / "blink.mp4"], options, workers=1)
 
 
+def test_videos_shorter_than_a_clip_are_counted(
+    tmp_path: Path, options: JobOptions, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_street(tmp_path / "long.mp4", frames=24)
+    for number in range(2):
+        write_street(tmp_path / f"blink{number}.mp4", frames=4, seed=number)
+    assert show_plan([tmp_path], replace(options, keep_share=1.0), parts=1, as_json=False) == 0
+    assert "2 of 3 videos are shorter than a clip (9 frames)" in capsys.readouterr().out
+
+
 def test_a_card_that_is_not_there_is_named(tmp_path: Path, videos: Path) -> None:
     (tmp_path / "settings.yaml").write_text("count: {detector: nope}")
     with pytest.raises(ConfigError, match="no model card is called 'nope'"):

@@ -14,6 +14,7 @@ from dataset.selection import (
     plan_looks,
     read_selection,
     select_clips,
+    twin_holders,
     video_splits,
     write_selection,
 )
@@ -79,6 +80,33 @@ def test_a_video_without_a_kept_clip_does_not_fill_train(beside):
     candidates = {val: rows(val, [5.0] * 4), train: [replace(row, video_id=train) for row in beside]}
     for previous in (None, select({train: candidates[train]})):
         assert {row.split for row in select(candidates, previous=previous).kept} == {"train"}
+
+
+TWINS = {"a": ["a", "b"], "b": ["a", "b"]}
+
+
+def test_videos_of_the_same_bytes_count_once_and_stand_in_one_split():
+    candidates = {name: rows(name, [5.0, 1.0]) for name in ("a", "b", "c")}
+    selection = select(candidates, SelectionRule(keep_share=0.5, val_share=0.5), twins=TWINS)
+    alone = select({name: candidates[name] for name in "ac"}, SelectionRule(keep_share=0.5, val_share=0.5))
+    assert [row for row in selection.rows if row.video_id != "b"] == list(alone.rows)
+    assert {row.reason for row in selection.rows if row.video_id == "b"} == {"same_as=a"}
+    assert twin_holders(selection) == {"b": "a"}
+
+
+def test_a_twin_that_comes_later_takes_nothing_over_and_one_that_is_left_keeps_the_split():
+    rule = SelectionRule(keep_share=1.0, val_share=0.5)
+    both = {name: rows(name, [5.0]) for name in ("a", "b", "c")}
+    for split in ("train", "val"):
+        first = select({name: both[name] for name in "bc"}, rule)
+        first = replace(first, rows=tuple(replace(row, split=split) for row in first.rows))
+        second = select(both, rule, previous=first, twins=TWINS, digests={"a": "t", "b": "t", "c": "d"})
+        assert [(row.key, row.split, row.reason) for row in second.rows] == [
+            ("a_0", None, "same_as=b"), ("b_0", split, None), ("c_0", split, None)
+        ]  # fmt: skip
+        assert select(both, rule, previous=second, twins=TWINS, digests={"a": "t", "b": "t", "c": "d"}) == second
+        third = select({name: both[name] for name in "ac"}, rule, previous=second)
+        assert [(row.key, row.split) for row in third.kept] == [("a_0", split), ("c_0", split)]
 
 
 def test_a_split_file_decides_and_must_name_every_video():

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -22,8 +23,9 @@ from labeling.ego_tracks import RunTracks, StoredTracks
 from labeling.encoding import EncoderSettings, VideoWriter
 from labeling.errors import ConfigError, DataError, TrajectoryError
 from labeling.video import probe
+from pipelines.commands import JobOptions, configured
 from pipelines.config import CameraSettings, Config, parse_config, video_camera
-from pipelines.given_tables import read_cameras, read_split
+from pipelines.given_tables import CAMERA_COLUMNS, read_cameras, read_split
 from pipelines.job import Job
 from pipelines.sources import Source
 from pipelines.stage import WorkItem
@@ -137,7 +139,7 @@ def test_a_table_of_cameras(tmp_path):
     path = tmp_path / "cameras.csv"
     path.write_text("video_id,fx,height_m\na,700,\nb,,1.3\n")
     assert read_cameras(path) == {"a": {"fx": 700}, "b": {"height_m": 1.3}}
-    with pytest.raises(ConfigError, match="none.csv: cannot be read as a CSV table"):
+    with pytest.raises(ConfigError, match=r"^--cameras \S+none.csv: no such file; check the path$"):
         read_cameras(tmp_path / "none.csv")
 
 
@@ -150,6 +152,8 @@ def test_a_table_of_cameras(tmp_path):
         ("video_id,fx\na,1\nb,2\na,3\n", "line 4 names video a again; keep one of its lines"),
         ("video_id,fx\na,1,2\n", "line 2 does not fit the columns video_id, fx; mend the table"),
         ("fx,video_id\n1\n", "line 2 does not fit the columns fx, video_id; mend the table"),
+        ("video_id,focal\na,1\n", "column 'focal' is not known; did you mean focal_sigma[?] choose from fx, fy, cx"),
+        ('video_id,fx\n"a,1\nb,2\n', "cannot be read as a CSV table .*; mend the table"),
     ],
 )
 def test_a_faulty_table_of_cameras_says_where_and_what(tmp_path, text, message):
@@ -157,6 +161,36 @@ def test_a_faulty_table_of_cameras_says_where_and_what(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(ConfigError, match=message):
         read_cameras(path)
+
+
+def test_a_table_of_cameras_holds_what_settings_do():
+    assert set(CAMERA_COLUMNS) == set(CameraSettings.model_fields)
+
+
+@pytest.mark.parametrize("values", [{"camera": {"foc": 1}}, {"cameras": {"a": {"foc": 1}}}], ids=["all", "one"])
+def test_a_setting_of_cameras_that_is_not_known_is_told_of_those_that_are(values):
+    with pytest.raises(ConfigError, match="foc is not a setting; .*choose one of fx, fy, cx"):
+        parse_config(values, "settings")
+
+
+@pytest.mark.parametrize(
+    ("option", "values", "message"),
+    [
+        ("keep_share", 2.0, "^--keep-share 2: select.keep_share is 2.0, but must be 1 or less"),
+        ("videos", "some", "^--videos some: pack.videos is 'some', but must be 'all' or 'rgb'"),
+        ("split", "video_id,split\na,test\n", "^--split .*t.csv: select.split.a is 'test', but must be 'train' or"),
+        ("cameras", "video_id,fx\na,1e300\n", "^--cameras .*t.csv: cameras.a.fx is 1e[+]300, but must be 1e[+]06 or"),
+        ("split", None, "^--split .*t.csv: no such file; check the path$"),
+        ("cameras", None, "^--cameras .*t.csv: no such file; check the path$"),
+    ],
+)
+def test_an_option_that_no_setting_allows_is_named_as_it_was_typed(tmp_path, option, values, message):
+    path = tmp_path / "t.csv"
+    if values is not None and option in ("split", "cameras"):
+        path.write_text(values)
+    value = path if option in ("split", "cameras") else values
+    with pytest.raises(ConfigError, match=message):
+        configured(small_config(), replace(JobOptions(), **{option: value}))
 
 
 def test_a_table_of_splits_needs_its_column(tmp_path):
@@ -175,8 +209,25 @@ def test_a_table_of_splits_needs_its_column(tmp_path):
         ({"fx": 700, "cx": 3}, "cx and cy go together"),
         ({"fy": 700}, "fy is given without fx"),
         ({"height_m": 0}, "camera.height_m"),
+        ({"fx": 1e300}, "camera.fx"),
+        ({"fx": 1e-300}, "camera.fx"),
+        ({"fx": 700, "cx": 1e300, "cy": 3}, "camera.cx"),
+        ({"height_m": 1e-300}, "camera.height_m"),
+        ({"height_m": 1e300}, "camera.height_m"),
     ],
-    ids=["zero", "NaN", "infinite", "half a centre", "fy alone", "on the ground"],
+    ids=[
+        "zero",
+        "NaN",
+        "infinite",
+        "half a centre",
+        "fy alone",
+        "on the ground",
+        "far off",
+        "tiny",
+        "centre far off",
+        "in the ground",
+        "in space",
+    ],
 )
 def test_a_camera_that_cannot_be_is_refused(camera, message):
     with pytest.raises(ConfigError, match=message):

@@ -1,0 +1,92 @@
+"""The command line's own errors: one line on standard error that names the option, and exit code 2."""
+
+import sys
+
+import pytest
+
+from pipelines.cli import app, main
+
+
+def words_of(value):
+    return " ".join(value) if isinstance(value, list) else ""
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Exit code, standard output and standard error of a command, in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words):
+        monkeypatch.setattr(sys, "argv", ["animatic", *words])
+        with pytest.raises(SystemExit) as end:
+            main()
+        out = capsys.readouterr()
+        return end.value.code, out.out, out.err
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["label", "--nope"], "no such option: --nope; `"),
+        (["label"], "missing option '--out' / '-o'; "),
+        (["plan"], "missing argument"),
+        (["label", "v.mp4", "-o", "J", "--workers", "two"], "'--workers'"),
+        (["label", "v.mp4", "-o", "J", "--workers", "-1"], "'--workers'"),
+        (["generate", "-o", "x", "--coordinates", "polar"], "'--coordinates'"),
+        (["inspect", "a", "b", "c"], "inspect --help` says what there is"),
+        (["labl"], "no such command 'labl'. Did you mean 'label'? `"),
+        (["models", "--nope"], "models --help` says"),
+    ],
+    ids=["option", "no option", "no argument", "type", "bound", "choice", "too many", "command", "group"],
+)
+def test_what_the_parser_refuses_is_one_line(run, words, message):
+    code, out, err = run(*words)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ") and message in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["--help"], ["label", "--help"], ["models", "--help"]], ids=words_of)
+def test_help_is_as_typer_gives_it(run, capsys, words):
+    ours = run(*words)
+    with pytest.raises(SystemExit):
+        app(words)
+    assert ours == (0, capsys.readouterr().out, "") and "Usage: " in ours[1]
+
+
+def test_no_word_at_all_shows_the_help(run):
+    code, out, err = run()
+    assert code == 2 and "Usage: " in out + err and "error" not in err
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["label", "v.mp4", "--out", ""], "--out"),
+        (["label", "v.mp4", "--out="], "--out"),
+        (["index", "v.mp4", "-o", ""], "-o"),
+        (["select", "--out", ""], "--out"),
+        (["cut", "--out", ""], "--out"),
+        (["export", "coco", "J", "--out", ""], "--out"),
+        (["label", "v.mp4", "-o", "J", "--config", ""], "--config"),
+        (["ego", "J", "--import", ""], "--import"),
+        (["models", "--models", ""], "--models"),
+        (["generate", "--out", ""], "--out"),
+        (["study", "--out", ""], "--out"),
+        (["label", "", "-o", "J"], "an argument"),
+        (["status", ""], "an argument"),
+        (["status", "--json", ""], "an argument"),
+    ],
+    ids=words_of,
+)
+def test_an_empty_path_names_no_folder(run, tmp_path, words, name):
+    code, out, err = run(*words)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"error: {name} is empty; give a path") and err.count("\n") == 1
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_text_may_be_empty(run):
+    _, _, err = run("cache", "J", "--backbone", "tiny", "--controls", "")
+    assert "is empty" not in err
