@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from labeling.errors import ConfigError
+from labeling.timeline import FPS
 
 Condition = Literal[
     "clean", "dusk", "night", "rain", "glare", "wiper", "motion_blur", "noise", "bonnet", "overlay", "letterbox",
@@ -32,7 +33,6 @@ levels of sigma (noise), a share of the picture's height or area (bonnet, overla
 
 _NIGHT_NOISE = 6.0
 _LAMP_LEVEL = 228.0
-_FPS = 24
 _RAMP_FRAMES = 120
 
 
@@ -78,7 +78,7 @@ def compress_frames(frames: Iterable[np.ndarray], *, crf: int) -> Iterator[np.nd
                 if width % 2 or height % 2:
                     raise ConfigError(f"{width}x{height}: H.264 in 4:2:0 needs even sides; resize the picture first")
                 options = {"crf": str(crf), "preset": "veryfast", "threads": "1"}
-                stream = container.add_stream("libx264", rate=Fraction(_FPS), options=options)
+                stream = container.add_stream("libx264", rate=Fraction(FPS), options=options)
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
                 stream.codec_context.thread_count = 1
             container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
@@ -155,7 +155,7 @@ def _glare(rgb: np.ndarray, amount: float, seed: int, frame: int, rng: np.random
 def _wiper(rgb: np.ndarray, amount: float, seed: int, frame: int, rng: np.random.Generator) -> np.ndarray:
     """One sweep there and back each second, blurred, from below the picture."""
     height, width = rgb.shape[:2]
-    phase = (frame % _FPS) / _FPS
+    phase = (frame % FPS) / FPS
     if phase > 0.75:
         return rgb.copy()
     angle = np.radians(-62 + 124 * (0.5 - 0.5 * np.cos(2 * np.pi * phase / 0.75)))
@@ -202,7 +202,7 @@ def _overlay(rgb: np.ndarray, amount: float, seed: int, frame: int, rng: np.rand
     out = rgb.copy()
     top = round(height * (1 - amount))
     out[top:] = (12, 14, 16)
-    text = f"CAM {seed % 100:02d}  {frame // (60 * _FPS):02d}:{frame // _FPS % 60:02d}.{frame % _FPS:02d}  000 km/h"
+    text = f"CAM {seed % 100:02d}  {frame // (60 * FPS):02d}:{frame // FPS % 60:02d}.{frame % FPS:02d}  000 km/h"
     scale = max(0.3, (height - top) / 60)
     cv2.putText(out, text, (int(0.02 * width), top + int(0.65 * (height - top))), cv2.FONT_HERSHEY_SIMPLEX, scale,
                 (230, 230, 200), max(1, int(scale * 1.5)), cv2.LINE_AA)  # fmt: skip

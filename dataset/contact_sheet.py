@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from dataset.loader import Sample
 from labeling.object_video import MOST_TRACKS, tracks_of
+from labeling.timeline import FPS
 
 SHEET_ROWS = {"rgb.mp4": "RGB", "skeleton.mp4": "skeleton", "ego.mp4": "ego", "objects.mp4": "objects"}
 """The videos of a sheet from the top, and what they are called."""
@@ -20,7 +21,6 @@ MOMENTS = 4
 TILE = (528, 352)
 """Width and height of a tile, pixels: half the working picture."""
 
-_FPS = 24
 _GAP, _GUTTER, _TIMES = 6, 116, 34
 _GROUND, _INK, _FAINT = "#14171c", "#f2f4f7", "#b6bfcb"
 _THINNEST_PX = 2.0
@@ -90,7 +90,7 @@ def contact_sheet(sample: Sample, *, moments: int = MOMENTS) -> np.ndarray:
     ]
     times = [
         _Text(
-            x=layout.left(n) + TILE[0] / 2, y=layout.top(0) - 10, words=f"{index / _FPS:.2f} s", points=12,
+            x=layout.left(n) + TILE[0] / 2, y=layout.top(0) - 10, words=f"{index / FPS:.2f} s", points=12,
             colour=_FAINT, side="center",
         )
         for n, (index, _) in enumerate(rows[0] if rows else [])

@@ -15,8 +15,7 @@ from dataset.selection import ClipRow, Selection, read_selection
 from dataset.shards import read_shard_index
 from labeling.errors import DataError
 from labeling.labels import Keypoints
-
-_FPS = 24
+from labeling.timeline import FPS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +91,7 @@ def summarize(job: Path) -> Summary:
     return Summary(
         videos=sum(r.state == "done" for r in receipts["index"].values()),
         source_hours=sum(r.facts.get("seconds", 0.0) for r in receipts["index"].values()) / 3600,
-        clip_hours=sum(lengths.get(key, 0) for key in splits) / _FPS / 3600,
+        clip_hours=sum(lengths.get(key, 0) for key in splits) / FPS / 3600,
         clips=len(selection.rows), kept=len(selection.rows) - len(dropped),
         packed={split: _count(splits, split) for split in ("train", "val")},
         dropped=reason_counts(dropped.values()), threshold=selection.threshold,

@@ -19,6 +19,7 @@ from labeling.labels import UNTRACKED
 _UNMATCHED = 1.0
 """Cost of a box or a track that is left alone: what a match of no overlap would cost. Were it more, a whole row of
 parked cars would change places rather than leave one out."""
+_COST_DIGITS = 6
 _PAST_FRAMES = 36
 """Frames over which a track remembers where it was seen."""
 
@@ -159,8 +160,8 @@ class BoxTracker:
             for track, (gone,) in zip(tracks, lost, strict=True)
         )
         cost = 1 - overlap + lost * settings.lost_cost + settings.back_cost * np.stack(list(turns))
-        # What costs as much as being left alone is left alone: between equals the solver would choose by a last digit.
-        allowed &= cost < _UNMATCHED
+        # Rounded: which of two equals the solver takes must not hang on a last digit, which differs between machines.
+        cost = np.minimum(np.round(cost, _COST_DIGITS), _UNMATCHED)
         rows, columns = linear_sum_assignment(np.where(allowed, cost, _UNMATCHED))
         taken = np.zeros(len(chosen), bool)
         for row, column in zip(rows, columns, strict=True):

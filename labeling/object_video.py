@@ -12,6 +12,7 @@ import numpy as np
 
 from labeling.errors import ConfigError
 from labeling.labels import UNTRACKED, Keypoints
+from labeling.skeleton_video import LABEL_HEIGHT, LABEL_WIDTH
 
 MOST_TRACKS = 5
 BOX_COLOURS = ((255, 64, 64), (64, 200, 64), (72, 120, 255), (255, 208, 48), (224, 72, 224))
@@ -49,7 +50,7 @@ def tracks_of(labels: Sequence[Keypoints]) -> set[int]:
 
 def object_frames(
     labels: Sequence[Keypoints], *, clip: FrameSpan, key: str, variant: int = 0, width: int = 768, height: int = 512,
-    label_width: int = 1056, label_height: int = 704,
+    label_width: int = LABEL_WIDTH, label_height: int = LABEL_HEIGHT,
 ) -> Iterator[np.ndarray]:  # fmt: skip
     """The object video of a clip, frame by frame.
 

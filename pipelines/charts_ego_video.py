@@ -13,9 +13,10 @@ from labeling.ego_reference import missing_library, reference_frames
 from labeling.ego_released import released_frames
 from labeling.ego_sphere import SPHERE_RADIUS_M, Lens, grid_step, world_raster
 from labeling.ego_video import world_frames
+from labeling.skeleton_video import LABEL_HEIGHT, LABEL_WIDTH
 from pipelines.charts import Chart, ChartPoint, Cost, Error, interleaved_ms, machine_name
 
-WIDTH, HEIGHT = 1056, 704
+WIDTH, HEIGHT = LABEL_WIDTH, LABEL_HEIGHT
 EXACT, REFERENCE, TRIVIAL = "every pixel", "pyvista (VTK)", "black"
 _STEPS = (2, 4, 8, 16, 32)
 _EDGE = np.ones((5, 5), np.uint8)

@@ -14,8 +14,9 @@ from dataset.street_labels import StreetObject
 from labeling.camera import Intrinsics, Trajectory
 from labeling.extractors import Extractors, choose_extractors
 from labeling.labels import Keypoints
+from labeling.skeleton_video import LABEL_HEIGHT, LABEL_WIDTH
 
-WIDTH, HEIGHT = 1056, 704
+WIDTH, HEIGHT = LABEL_WIDTH, LABEL_HEIGHT
 HELD_OUT_SEED = 97_000
 """Streets from here on are used neither for training nor for thresholds nor for the cards' figures."""
 

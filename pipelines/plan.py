@@ -16,7 +16,7 @@ from dataset.receipts import Receipt, read_receipts
 from labeling.ego_calibration import ROAD_FRAMES
 from labeling.errors import ConfigError, VideoError
 from labeling.mp4_boxes import is_cut_off
-from labeling.timeline import ClipSettings
+from labeling.timeline import FPS, ClipSettings
 from labeling.video import probe, read_packet_times
 from pipelines.commands import JobOptions, chosen_cards, configured
 from pipelines.config import Config
@@ -31,7 +31,6 @@ from pipelines.stages_source import packet_facts
 from pipelines.trial_windows import SourceClips, plan_windows, read_clips
 
 CALIBRATION_S = 60.0
-_FPS = 24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,7 +141,7 @@ def plan_job(
 
 def count_candidates(length_s: float, clip: ClipSettings) -> int:
     """Clips that fit on a timeline of that length."""
-    frames = int(length_s * _FPS) + 1
+    frames = int(length_s * FPS) + 1
     return 0 if frames < clip.clip_frames else (frames - clip.clip_frames) // clip.stride_frames + 1
 
 
@@ -157,7 +156,7 @@ def _lengths_s(
         try:
             info = probe(source.path)
             # The last frame is shown for its own time: the timeline ends where it begins.
-            length_s = info.duration_s - 1 / (info.frame_rate or _FPS)
+            length_s = info.duration_s - 1 / (info.frame_rate or FPS)
             if is_cut_off(source.path):
                 # The header promises what is no longer there; only the packets know.
                 cut_off[source.video_id] = packet_facts(info, read_packet_times(source.path))
@@ -254,7 +253,7 @@ class _Measured:
         for receipt in receipts["cut"].values():
             frames[receipt.item.split("/")[0]] += int(receipt.facts["frames"])
         return cls(
-            window_s=frames.total() / _FPS, videos=len(frames),
+            window_s=frames.total() / FPS, videos=len(frames),
             video_s=sum(float(receipt.facts["seconds"]) for receipt in receipts["index"].values()),
             clips=clips, kept_clips=kept, frames_per_clip=frames.total() / kept,
             camera_frames=sum(min(count, ROAD_FRAMES) for count in frames.values()),
@@ -295,4 +294,4 @@ def _largest_part(lengths_s: dict[str, float], parts: int) -> float:
 
 
 def _clip_s(clip: ClipSettings) -> float:
-    return clip.clip_frames / _FPS
+    return clip.clip_frames / FPS

@@ -5,12 +5,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from dataset.receipts import hashed_share
-from labeling.timeline import ClipSettings, Span, plan_clips, plan_timeline
+from labeling.timeline import FPS, ClipSettings, Span, plan_clips, plan_timeline
 from labeling.video import read_packet_times
 from pipelines.sources import Source
 
 _WINDOWS = 3
-_FPS = 24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,7 +23,7 @@ class SourceClips:
 
     def around(self, clips: Sequence[Span]) -> tuple[float, float]:
         """Seconds to leave out at the start and at the end so that only ``clips`` are left, half a frame to spare."""
-        return max(0.0, (clips[0].start - 0.5) / _FPS), max(0.0, (self.frames - clips[-1].end - 0.5) / _FPS)
+        return max(0.0, (clips[0].start - 0.5) / FPS), max(0.0, (self.frames - clips[-1].end - 0.5) / FPS)
 
 
 def read_clips(source: Source, clip: ClipSettings) -> SourceClips:
@@ -50,7 +49,7 @@ def plan_windows(
     """
     drawn = sorted(sources, key=lambda source: hashed_share("plan", source.video_id))
     windows: list[Source] = []
-    left = seconds * _FPS
+    left = seconds * FPS
     for source in drawn:
         if windows and left < clip_frames:
             break

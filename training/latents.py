@@ -244,7 +244,9 @@ def encode_clip(
 def _picture_size(sample: ClipSample) -> tuple[int, int]:
     """Width and height of a clip's picture, which its labels are in."""
     size = sample.meta.get("picture", sample.meta)
-    return int(size.get("width", 1056)), int(size.get("height", 704))
+    if not {"width", "height"} <= size.keys():
+        raise DataError(f"{sample.key}: its record does not say how large its picture is; pack it again")
+    return int(size["width"]), int(size["height"])
 
 
 def _videos(

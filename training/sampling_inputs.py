@@ -14,7 +14,7 @@ from labeling.ego_video import ego_frames
 from labeling.errors import ConfigError, DataError
 from labeling.labels import Keypoints
 from labeling.object_video import object_frames
-from labeling.skeleton_video import draw_skeletons
+from labeling.skeleton_video import LABEL_WIDTH, draw_skeletons
 from labeling.timeline import Span
 from labeling.video import read_frames
 from training.config import PictureConfig
@@ -23,8 +23,6 @@ from training.ego_recipes import recipe_trajectory
 if TYPE_CHECKING:
     from labeling.extractors import ExtractorChoice
 
-LABEL_WIDTH = 1056
-"""Extractors look at pictures this wide, whatever the backbone's size."""
 _MOST_STRETCH = 0.01
 """Of one side against the other: half a pixel in a hundred at the picture's edge."""
 
@@ -125,6 +123,7 @@ def first_skeleton(
     from labeling.observation import looks_of
 
     choice = skeleton_extractors(extractors, models_dir=models_dir)
+    # Extractors look at pictures of their own width, whatever the backbone's size.
     height = 2 * round(LABEL_WIDTH * picture.rgb_height / picture.rgb_width / 2)
     seen = covered(image, width=LABEL_WIDTH, height=height)
     looks = looks_of(Extractors(choice, models_dir=models_dir))
