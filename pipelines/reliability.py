@@ -126,9 +126,11 @@ def _draw_shares(axes: Any, curves: Sequence[ReliabilityCurve]) -> None:
         label="at least, at a score of 0.9",
     )
     shares = [one.share for curve in curves for one in curve.bins if one.points]
-    axes.set(xlim=(0, 1), ylim=(min([_LEAST_DRAWN, *shares]), 1.02), ylabel="share within 0.1 of the box diagonal")
+    axes.set(
+        xlim=(0, 1), ylim=(min([_LEAST_DRAWN, *shares]) - 0.03, 1.02), ylabel="share within 0.1 of the box diagonal"
+    )
     axes.set_xticks(BINS)
-    axes.legend(frameon=False, loc="lower right", fontsize=10)
+    axes.legend(frameon=False, loc="lower center", fontsize=10)
 
 
 def _draw_counts(axes: Any, curves: Sequence[ReliabilityCurve]) -> None:
