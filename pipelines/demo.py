@@ -177,7 +177,8 @@ class CarComparison:
     found: list[bool] = field(default_factory=list)
     """Of each true car that is asked for."""
     right: list[bool] = field(default_factory=list)
-    """Of each labelled car, whether it is a true one, however small."""
+    """Of each labelled car, whether it is a true one; what is no car, but too low or too hidden to be asked for, is
+    left out."""
     errors_px: list[np.ndarray] = field(default_factory=list)
     """(n,) distances of the points of each found car that are visible and labelled."""
 
@@ -185,8 +186,7 @@ class CarComparison:
         """One frame's labels and objects, in the same pixels; what is no car is left out."""
         (matched,) = match_frames(labels, [truth], first_frame=frame, categories=("car",))
         paired = sum(label is not None for _, label in matched.pairs)
-        cars = sum(label.category == "car" for label in labels)
-        self.right.extend([True] * paired + [False] * (cars - paired))
+        self.right.extend([True] * paired + [False] * len(matched.phantoms))
         for thing, label in matched.judged:
             self.found.append(label is not None)
             if label is not None and label.schema == thing.schema:
