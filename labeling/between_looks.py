@@ -147,9 +147,8 @@ class BetweenLooks:
         return [label for path in paths for label in (path[0], *along_path(path)) if label.frame < frame]
 
     def _apart(self, earlier: int, later: int) -> int:
-        """Frames of the grid from one moment to another, which may be the next that comes."""
-        known = len(self.clocks) - 1
-        return self.clocks[min(later, known)] + max(0, later - known) - self.clocks[earlier]
+        """Frames of the grid from one moment to another."""
+        return self.clocks[later] - self.clocks[earlier]
 
     def _inside(self, labels: list[Keypoints]) -> list[Keypoints]:
         """Without what flow took out of the picture."""

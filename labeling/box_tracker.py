@@ -20,6 +20,7 @@ _UNMATCHED = 1.0
 """Cost of a box or a track that is left alone: what a match of no overlap would cost. Were it more, a whole row of
 parked cars would change places rather than leave one out."""
 _COST_DIGITS = 6
+"""Of costs that are told apart."""
 _PAST_FRAMES = 36
 """Frames over which a track remembers where it was seen."""
 
