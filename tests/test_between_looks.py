@@ -8,6 +8,7 @@ from moving_card import MovingCard
 
 from labeling.between_looks import BetweenLooks, cut_at_border
 from labeling.carrying import small_grey
+from labeling.errors import DataError
 from labeling.labels import Keypoints
 
 SCENE = MovingCard(speed=1.5)
@@ -93,3 +94,18 @@ def test_boxes_are_cut_at_the_picture() -> None:
     assert [label.box_xyxy.tolist() for label in cut] == [[0, 0, 50, 60], [300, 200, 320, 224], [10, 10, 20, 20]]
     assert cut[2] is labels[2] and cut_at_border([], width=320, height=224) == []
     assert [label.track_id for label in cut_at_border(labels, width=320, height=224, least_inside=0.6)] == [0, 2]
+
+
+@pytest.mark.parametrize("wrong", ["a number that is none", "a point too few"])
+def test_labels_made_together_are_checked_together(wrong: str) -> None:
+    label = seen(0)
+    boxes, points = np.stack([label.box_xyxy] * 3), np.stack([label.points] * 3)
+    sources, scores = np.stack([label.point_source] * 3), np.full(3, 0.5)
+    made = label.elsewhere([4, 5, 6], boxes_xyxy=boxes, points=points, point_source=sources, scores=scores)
+    assert [(one.frame, one.track_id, one.score) for one in made] == [(n, label.track_id, 0.5) for n in (4, 5, 6)]
+    if wrong == "a point too few":
+        points = points[:, :-1]
+    else:
+        points[1, 3, 0] = np.nan
+    with pytest.raises(DataError):
+        label.elsewhere([4, 5, 6], boxes_xyxy=boxes, points=points, point_source=sources, scores=scores)
