@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from labeling.box_tracker import BoxTracker, TrackerSettings
-from labeling.carrying import interpolate_gap
+from labeling.carrying import interpolate_gaps
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.schemas import Category
 from labeling.tracking import TrackedLook
@@ -70,7 +70,7 @@ def _of_category(looks: Sequence[TrackedLook], believed: frozenset[int], categor
                 continue
             after = ahead.get(sighting.label.track_id)
             if after and after.look == number + 1 and (sighting.reached or after.reached):
-                found += interpolate_gap(sighting.label, after.label)
+                found += interpolate_gaps([sighting.label], [after.label])
             ahead[sighting.label.track_id] = sighting
     return found
 

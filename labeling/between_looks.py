@@ -6,10 +6,11 @@ gap each, on average where it truly went or came from.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from statistics import median
 
 import numpy as np
 
-from labeling.carrying import UNSEEN_FRAMES, along_path, box_diagonal, carry, close_gap, interpolate_gap
+from labeling.carrying import UNSEEN_FRAMES, along_path, box_diagonal, carry, close_gaps, interpolate_gaps
 from labeling.labels import Keypoints
 
 _BORDER_PX = 4.0
@@ -89,7 +90,8 @@ class BetweenLooks:
         """
         now = {label.track_id: label for label in seen}
         labels: list[Keypoints] = []
-        misses = []
+        arriving: dict[str, list[int]] = {}
+        straight: dict[str, list[int]] = {}
         for label in self.seen:
             path, end = self._paths[label.track_id], now.get(label.track_id)
             if end is None:
@@ -100,13 +102,17 @@ class BetweenLooks:
                     if step.frame <= last and self._apart(label.frame, step.frame) <= self.shown
                 ]  # fmt: skip
             elif len(path) > 1 and path[-1].frame == frame:
-                misses.append(_miss(path[-1], end))
-                labels += close_gap(path, end)
+                arriving.setdefault(label.schema, []).append(label.track_id)
             else:
-                labels += interpolate_gap(label, end)
+                straight.setdefault(label.schema, []).append(label.track_id)
+        for ids in arriving.values():
+            labels += close_gaps([self._paths[i] for i in ids], [now[i] for i in ids])
+        for ids in straight.values():
+            labels += interpolate_gaps([self._paths[i][0] for i in ids], [now[i] for i in ids])
+        misses = [_miss(self._paths[i][-1], now[i]) for ids in arriving.values() for i in ids]
         known = {label.track_id for label in self.seen}
         labels += self._came_from([label for label in seen if label.track_id not in known], frame)
-        return self._inside(labels), float(np.median(misses)) if misses else 0.0
+        return self._inside(labels), median(misses) if misses else 0.0
 
     def run_out(self, grey: np.ndarray, *, frame: int) -> list[Keypoints] | None:
         """The labels up to a run's last frame, or None where flow cannot take everything there: it must be looked at.
@@ -191,4 +197,4 @@ def _miss(carried: Keypoints, seen: Keypoints) -> float:
     if not both.any():
         return 0.0
     distance = np.linalg.norm(carried.points[both, :2] - seen.points[both, :2], axis=1)
-    return float(np.median(distance)) / box_diagonal(seen.box_xyxy)
+    return median(distance.tolist()) / box_diagonal(seen.box_xyxy)

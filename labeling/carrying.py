@@ -7,7 +7,7 @@ followed each for itself as well, and a joint that lost its ground moves with th
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -83,63 +83,113 @@ def carry(previous: np.ndarray, current: np.ndarray, labels: Sequence[Keypoints]
     ]
 
 
-def close_gap(path: Sequence[Keypoints], end: Keypoints) -> list[Keypoints]:
-    """A carried object, corrected by where it was next detected.
+def close_gaps(paths: Sequence[Sequence[Keypoints]], ends: Sequence[Keypoints]) -> list[Keypoints]:
+    """Carried objects, corrected by where they were next detected.
 
     What was missed at the end is spread evenly over the way, so that the path meets both detections. A point that was
     missed by far was not followed: it is interpolated between the detections instead. A point that only the first end
     knows is left as carried for as long as it may be shown; one that only the other knows is absent.
 
     Args:
-        path: the object at the first detection, then wherever it was carried to, last into ``end``'s own frame.
-        end: the same object as detected there.
+        paths: of M objects of one schema that flow carried together: each at the first detection, then wherever it was
+            carried to, last into the ends' own frame.
+        ends: (M) the same objects as detected there.
 
     Returns:
-        A label for every frame between the detections; those that the path passes over are interpolated.
+        A label of each object for every frame between the detections; those that the paths pass over are interpolated.
     """
-    start, arrived = path[0], path[-1]
-    gap = end.frame - start.frame
-    miss = end.points[:, :2] - arrived.points[:, :2]
-    both = start.present & end.present
-    believed = both & arrived.present & (np.linalg.norm(miss, axis=1) <= _MAX_CLOSING * box_diagonal(end.box_xyxy))
-    rough = both & ~believed
-    nodes = [start]
-    for label in path[1:-1]:
-        share = np.float32((label.frame - start.frame) / gap)
-        points, source = label.points.copy(), label.point_source.copy()
-        points[believed, :2] += share * miss[believed]
-        points[rough] = (1 - share) * start.points[rough] + share * end.points[rough]
-        points[both, 2] = np.minimum(start.points[both, 2], end.points[both, 2])
-        source[rough] = POINT_INTERPOLATED
-        if label.frame - start.frame > UNSEEN_FRAMES:
-            points[~both], source[~both] = 0, POINT_ABSENT
-        box = label.box_xyxy + share * (end.box_xyxy - arrived.box_xyxy)
-        score = float((1 - share) * start.score + share * end.score)
-        nodes.append(replace(label, points=points, point_source=source, box_xyxy=box, score=score))
-    return along_path([*nodes, end])[:-1]
+    nodes, arrived = _nodes([[*path[:-1], end] for path, end in zip(paths, ends, strict=True)]), _nodes(paths)
+    since = nodes.frames - nodes.frames[0]
+    shares = (since[1:-1] / since[-1]).astype(np.float32)[:, None]
+    points, came_to = nodes.points, arrived.points[:, -1]
+    start, end = points[:, 0], points[:, -1]
+    miss = end[..., :2] - came_to[..., :2]
+    near = np.linalg.norm(miss, axis=2) <= _MAX_CLOSING * np.array([[box_diagonal(one.box_xyxy)] for one in ends])
+    both = (start[..., 2] > 0) & (end[..., 2] > 0)
+    believed = both & (came_to[..., 2] > 0) & near
+    rough = (both & ~believed)[:, None]
+    inner, source = points[:, 1:-1], nodes.point_source[:, 1:-1]
+    inner[..., :2] += shares[..., None] * np.where(believed[..., None], miss, 0)[:, None]
+    np.copyto(inner, _straight(start, end, shares), where=rough[..., None])
+    np.copyto(inner[..., 2], np.minimum(start[..., 2], end[..., 2])[:, None], where=both[:, None])
+    np.copyto(source, POINT_INTERPOLATED, where=rough)
+    unseen = (since[1:-1] > UNSEEN_FRAMES)[:, None] & ~both[:, None]
+    inner[unseen], source[unseen] = 0, POINT_ABSENT
+    nodes.boxes_xyxy[:, 1:-1] += shares * (nodes.boxes_xyxy[:, -1] - arrived.boxes_xyxy[:, -1])[:, None]
+    nodes.scores[:, 1:-1] = _straight(nodes.scores[:, 0], nodes.scores[:, -1], shares[:, 0])
+    return _between([path[0] for path in paths], nodes)
 
 
 def along_path(path: Sequence[Keypoints]) -> list[Keypoints]:
     """The labels of a path after its first, those between its nodes interpolated."""
-    return [label for a, b in pairwise(path) for label in (*interpolate_gap(a, b), b)]
+    return [*_between(path[:1], _nodes([path])), path[-1]] if len(path) > 1 else []
 
 
-def interpolate_gap(start: Keypoints, end: Keypoints) -> list[Keypoints]:
-    """The labels between two labels of one object, on straight lines; points that only one knows are absent."""
-    gap = end.frame - start.frame
-    if gap == 1:
-        return []
-    both = start.present & end.present
-    shares = (np.arange(1, gap) / gap).astype(np.float32)
-    first, last = (1 - shares)[:, None], shares[:, None]
-    points = (first[..., None] * start.points + last[..., None] * end.points) * both[:, None]
-    points[..., 2] = np.where(both, np.minimum(start.points[:, 2], end.points[:, 2]), 0)
-    source = np.where(both, POINT_INTERPOLATED, POINT_ABSENT).astype(np.int8)
-    return start.elsewhere(
-        range(start.frame + 1, end.frame), boxes_xyxy=first * start.box_xyxy + last * end.box_xyxy, points=points,
-        point_source=np.broadcast_to(source, points.shape[:2]),
-        scores=(1 - shares) * start.score + shares * end.score,
-    )  # fmt: skip
+def interpolate_gaps(starts: Sequence[Keypoints], ends: Sequence[Keypoints]) -> list[Keypoints]:
+    """The labels of objects of one schema between two frames, on straight lines; points that only one end knows are
+    absent."""
+    return _between(starts, _nodes(list(zip(starts, ends, strict=True)))) if ends[0].frame - starts[0].frame > 1 else []
+
+
+class _Nodes(NamedTuple):
+    """Paths of M objects of one schema over the same N frames, side by side: what is done to all of them costs hardly
+    more than what is done to one."""
+
+    frames: np.ndarray
+    """(N,) int64, rising."""
+    boxes_xyxy: np.ndarray
+    """(M, N, 4) float32."""
+    points: np.ndarray
+    """(M, N, K, 3) float32."""
+    point_source: np.ndarray
+    """(M, N, K) int8."""
+    scores: np.ndarray
+    """(M, N) float64."""
+
+
+def _nodes(paths: Sequence[Sequence[Keypoints]]) -> _Nodes:
+    return _Nodes(
+        frames=np.array([label.frame for label in paths[0]]),
+        boxes_xyxy=np.array([[label.box_xyxy for label in path] for path in paths]),
+        points=np.array([[label.points for label in path] for path in paths]),
+        point_source=np.array([[label.point_source for label in path] for path in paths]),
+        scores=np.array([[label.score for label in path] for path in paths]),
+    )
+
+
+def _straight(start: np.ndarray, end: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """(M, T, ...) values at T shares, (T, 1...), of the way from (M, ...) to (M, ...)."""
+    shares = shares.reshape(-1, *(1,) * (start.ndim - 1))
+    return (1 - shares) * start[:, None] + shares * end[:, None]
+
+
+def _between(starts: Sequence[Keypoints], nodes: _Nodes) -> list[Keypoints]:
+    """The labels of M objects in every frame between the first node and the last: the nodes as they are, the others on
+    straight lines between their neighbours."""
+    frames = np.arange(nodes.frames[0] + 1, nodes.frames[-1])
+    last = np.searchsorted(nodes.frames, frames, side="right") - 1
+    following = last + 1
+    gone = frames - nodes.frames[last]
+    at_node = (gone == 0)[:, None]
+    after = (gone / (nodes.frames[following] - nodes.frames[last])).astype(np.float32)[:, None]
+    before = 1 - after
+    point_scores = nodes.points[..., 2]
+    least = np.minimum(point_scores[:, last], point_scores[:, following])
+    known = (least > 0) | at_node
+    points = before[..., None] * nodes.points[:, last] + after[..., None] * nodes.points[:, following]
+    points[..., 2] = np.where(at_node, point_scores[:, last], least)
+    points *= known[..., None]
+    sources = np.where(at_node, nodes.point_source[:, last], np.int8(POINT_INTERPOLATED)) * known
+    boxes = before * nodes.boxes_xyxy[:, last] + after * nodes.boxes_xyxy[:, following]
+    scores = before[:, 0] * nodes.scores[:, last] + after[:, 0] * nodes.scores[:, following]
+    numbers = frames.tolist()
+    return [
+        label
+        for start, *of_one in zip(starts, boxes, points, sources, scores, strict=True)
+        for label in start.elsewhere(
+            numbers, boxes_xyxy=of_one[0], points=of_one[1], point_source=of_one[2], scores=of_one[3]
+        )
+    ]
 
 
 def box_diagonal(box_xyxy: np.ndarray) -> float:

@@ -25,7 +25,7 @@ from labeling.extractors import Extractors
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.moments import Moments, same_picture
 from labeling.observation import Look, looks_of
-from labeling.picture_turn import picture_turn, turn_view
+from labeling.picture_turn import TurnMeter
 from labeling.smoothing import SmoothingSettings, drop_unseen, smooth_tracks
 from labeling.tracking import RunTracker, TrackedLook, believed_tracks, drop_brief_tracks, trim_doubt
 
@@ -40,8 +40,6 @@ _BEGIN_SHARE, _PLAIN_SHARE, _DOUBT_SHARE = 0.9, 0.8, 0.95
 something is late. Where scores are decided, it is shown from one plain look to another; and what is not quite sure and
 half behind a better label of its kind is that one's double, or hardly in view."""
 _HALF_COVERED = 0.5
-_TURN_STEP = 4
-"""Frames after which two pictures of a camera that turns sharply have too little in common."""
 
 
 def label_frames(
@@ -87,8 +85,8 @@ def label_with(
 ) -> list[Keypoints]:
     """As ``label_frames``, for anything that looks at a frame and tells what it sees."""
     settings = effort if isinstance(effort, EffortSettings) else EFFORTS[effort]
-    ids, moments = count(), Moments()
-    channels = [_Channel(look, settings, clocks=moments.clocks, ids=ids) for look in looks]
+    ids, moments, turns = count(), Moments(), TurnMeter()
+    channels = [_Channel(look, settings, clocks=moments.clocks, ids=ids, turns=turns) for look in looks]
     latest = None
     for number, frame in enumerate(frames, start=first_frame):
         if latest is not None and number not in breaks and (number in repeats or same_picture(latest, frame)):
@@ -96,8 +94,15 @@ def label_with(
             continue
         moments.new(number)
         views, latest = _Views(frame, number), frame
+        if number in breaks:
+            for channel in channels:
+                channel.restart()
+        if not any(channel.follows for channel in channels):
+            turns.forget()
+        elif turns.due(moments.latest):
+            turns.reach(frame, moments.latest)
         for channel in channels:
-            channel.push(views, number=moments.latest, fresh=number in breaks)
+            channel.push(views, number=moments.latest)
     for channel in channels:
         channel.finish()
     labels = [label for channel in channels for label in channel.labels]
@@ -155,7 +160,7 @@ def _on_grid(labels: Sequence[Keypoints], shown: Sequence[int], *, first_frame: 
 
 
 class _Views:
-    """A frame and its small pictures, each made once, when somebody first needs it."""
+    """A frame and its small picture, made once, when somebody first needs it."""
 
     def __init__(self, frame: np.ndarray, number: int) -> None:
         self.frame, self.number = frame, number
@@ -165,22 +170,24 @@ class _Views:
         """For flow."""
         return small_grey(self.frame)
 
-    @cached_property
-    def far(self) -> np.ndarray:
-        """For the camera's turn."""
-        return turn_view(self.frame)
-
 
 class _Channel:
     """One kind of look (objects, or a bottom-up network's) with its own rhythm, tracks and carried points."""
 
-    def __init__(self, look: Look, settings: EffortSettings, *, clocks: Sequence[int], ids: Iterator[int]) -> None:
-        self.look, self.settings, self._clocks = look, settings, clocks
+    def __init__(
+        self, look: Look, settings: EffortSettings, *, clocks: Sequence[int], ids: Iterator[int], turns: TurnMeter
+    ) -> None:
+        self.look, self.settings, self._clocks, self._turns = look, settings, clocks, turns
         self.labels: list[Keypoints] = []
         self.looks = 0
         self.sure_scores = {category: settings.sure_share * score for category, score in look.sure_scores.items()}
         self._tracker = RunTracker(start_scores=self._scores(_BEGIN_SHARE), ids=ids)
-        self._forget()
+        self._begin()
+
+    @property
+    def follows(self) -> bool:
+        """Whether it has tracks, which want to know how the camera turns."""
+        return not self._tracker.idle
 
     @property
     def doubts(self) -> Mapping[str, float]:
@@ -193,33 +200,30 @@ class _Channel:
     def _scores(self, share: float) -> dict[str, float]:
         return {category: share * score for category, score in self.sure_scores.items()}
 
-    def _forget(self) -> None:
+    def _begin(self) -> None:
         flows = self.look.carries and self.settings.flow_step > 0
-        self._tracker.restart()
         self._rhythm = Rhythm(self.settings, flows=flows)
         self._between = BetweenLooks(
             flow_step=self.settings.flow_step, shown_frames=self.settings.max_gap // 2, clocks=self._clocks
         )
-        self._far: tuple[np.ndarray, int] | None = None
-        self._turned = np.eye(3)
         self._latest: tuple[_Views, int] | None = None
         self._looks: list[TrackedLook] = []
         self._labels: list[Keypoints] = []
 
-    def push(self, views: _Views, *, number: int, fresh: bool) -> None:
+    def restart(self) -> None:
+        """Nothing of what came before holds any more."""
+        self.finish()
+        self._tracker.restart()
+        self._begin()
+
+    def push(self, views: _Views, *, number: int) -> None:
         """The next moment of the run.
 
         Args:
             views: its picture.
             number: of the moment.
-            fresh: nothing of what came before holds any more.
         """
-        if fresh:
-            self.finish()
-            self._forget()
         self._latest = (views, number)
-        if self._far and number - self._far[1] >= _TURN_STEP:
-            self._turn(views, number)
         last = self._between.frame
         due = last is None or self._since_look(number) >= self._rhythm.gap
         if not due and self._between.due(number):
@@ -259,34 +263,25 @@ class _Channel:
         return self._clocks[number] - self._clocks[self._between.frame]
 
     def _look(self, views: _Views, number: int) -> None:
-        clock = self._clocks[number]
+        clock, turn = self._clocks[number], np.eye(3)
         if self._between.arriving(number):
             self._between.carry(views.grey, frame=number)
-        self._turn(views, number)
+        if self.follows and self._between.frame is not None:
+            self._turns.reach(views.frame, number)
+            turn = self._turns.since(self._between.frame)
         seen = [label.renumbered(frame=number) for label in self.look.see(views.frame, views.number)]
         carried = self._between.carried(number)
-        named = self._tracker.update(seen, frame=clock, previous_to_current=self._turned, carried=carried)
-        self._looks.append(TrackedLook(frame=clock, labels=tuple(named), turn=self._turned))
+        named = self._tracker.update(seen, frame=clock, previous_to_current=turn, carried=carried)
+        self._looks.append(TrackedLook(frame=clock, labels=tuple(named), turn=turn))
         seen = [label for label in named if label.track_id != UNTRACKED]
-        self._turned = np.eye(3)
-        if self._far is None and not self._tracker.idle:
-            self._far = (views.far, number)
+        if self.follows:
+            self._turns.reach(views.frame, number)
         self.looks += 1
         between, miss = self._between.close(seen, frame=number)
         self._labels += between + seen
         self._rhythm.after(seen, self._between.seen, miss=miss, frame=clock)
         follow = seen and self._rhythm.flows and self._rhythm.gap > 1
         self._between.start(seen, frame=number, grey=views.grey if follow else None)
-
-    def _turn(self, views: _Views, number: int) -> None:
-        """Add the camera's turn up to this frame to what it turned since the last look; of no use without tracks."""
-        if self._tracker.idle:
-            self._far = None
-            return
-        if self._far is not None:
-            height, width = views.frame.shape[:2]
-            self._turned = picture_turn(self._far[0], views.far, width=width, height=height) @ self._turned
-        self._far = (views.far, number)
 
 
 def _counted_from_0(labels: Iterable[Keypoints]) -> list[Keypoints]:

@@ -82,8 +82,8 @@ class Keypoints:
     def _twin(self, **changes: object) -> "Keypoints":
         """``dataclasses.replace`` without a check."""
         twin = object.__new__(Keypoints)
-        for name in _FIELDS:
-            object.__setattr__(twin, name, changes[name] if name in changes else getattr(self, name))
+        for name, read, write in _SLOTS:
+            write(twin, changes[name] if name in changes else read(self))
         return twin
 
     @property
@@ -92,7 +92,10 @@ class Keypoints:
         return self.points[:, 2] > 0
 
 
-_FIELDS = tuple(field.name for field in fields(Keypoints))
+_SLOTS = tuple(
+    (field.name, slot.__get__, slot.__set__) for field in fields(Keypoints) for slot in [vars(Keypoints)[field.name]]
+)
+"""By name, how each field is read and written: half of what going through ``object`` costs."""
 
 
 def _check(label: Keypoints, shapes: tuple[tuple[int, ...], ...], total: float) -> None:

@@ -5,6 +5,8 @@ things went. Phase correlation of the upper part of the picture, where far thing
 their shift; a camera of the assumed focal length makes a turn of it.
 """
 
+import functools
+
 import cv2
 import numpy as np
 
@@ -18,11 +20,54 @@ _LEAST_RESPONSE = 0.45
 """Below it no shift stands out: the pictures have nothing far in common (noise alone reaches 0.4)."""
 
 
+class TurnMeter:
+    """How the camera of a run turned, measured once for all who ask.
+
+    Args:
+        max_step: moments after which two pictures of a camera that turns sharply have too little in common.
+    """
+
+    def __init__(self, *, max_step: int = 4) -> None:
+        self.max_step = max_step
+        self._latest: tuple[np.ndarray, int] | None = None
+        self._steps: list[tuple[int, np.ndarray]] = []
+        """Moments, and the homography from the one before to each."""
+
+    def forget(self) -> None:
+        """What comes next has nothing to do with what was, or nobody asks."""
+        self._latest, self._steps = None, []
+
+    def due(self, moment: int) -> bool:
+        """Whether the turn up to ``moment`` must be measured so as not to lose it."""
+        return self._latest is not None and moment - self._latest[1] >= self.max_step
+
+    def reach(self, frame: np.ndarray, moment: int) -> None:
+        """Measure the turn up to ``moment``, whose picture is (H, W, 3) uint8 RGB; the first time it begins there."""
+        if self._latest is not None and self._latest[1] == moment:
+            return
+        view = turn_view(frame)
+        if self._latest is not None:
+            height, width = frame.shape[:2]
+            self._steps.append((moment, picture_turn(self._latest[0], view, width=width, height=height)))
+        self._latest = (view, moment)
+
+    def since(self, moment: int) -> np.ndarray:
+        """(3, 3) homography of frame pixels that the turn from ``moment``, a measured one, to the last measured one
+        makes of far points."""
+        turned = np.eye(3)
+        for reached, step in reversed(self._steps):
+            if reached <= moment:
+                break
+            turned = turned @ step
+        return turned
+
+
 def turn_view(frame: np.ndarray) -> np.ndarray:
-    """(48, 128) float32 picture of the upper part of an (H, W, 3) uint8 RGB frame, for ``picture_turn``."""
+    """(48, 128) float32 picture of the upper part of an (H, W, 3) uint8 RGB frame, for ``picture_turn``: dark towards
+    its borders, so that what enters and leaves says little."""
     # One channel and half of its rows and columns tell as much and cost a fifth.
     upper = np.ascontiguousarray(frame[: round(frame.shape[0] * _UPPER_SHARE) : 2, ::2, 1])
-    return cv2.resize(upper, _VIEW_SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return cv2.resize(upper, _VIEW_SIZE, interpolation=cv2.INTER_AREA) * _window()
 
 
 def picture_turn(before: np.ndarray, after: np.ndarray, *, width: int, height: int) -> np.ndarray:
@@ -34,16 +79,26 @@ def picture_turn(before: np.ndarray, after: np.ndarray, *, width: int, height: i
         width: of the frames, pixels.
         height: of the frames, pixels.
     """
-    # OpenCV multiplies what it is given by a window where it lies, and views are compared more than once. Squared, a
-    # Hann window leaves more of what enters and leaves out.
-    window = cv2.createHanningWindow(_VIEW_SIZE, cv2.CV_32F) ** 2
-    shift, response = cv2.phaseCorrelate(before * window, after * window)
+    shift, response = cv2.phaseCorrelate(before, after)
     if response < _LEAST_RESPONSE:
         return np.eye(3)
-    camera = prior_intrinsics(width, height)
-    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    matrix, inverse = _camera(width, height)
     pixels = np.array(shift) * (width, round(height * _UPPER_SHARE)) / _VIEW_SIZE
-    yaw, pitch = np.arctan(pixels / (camera.fx, camera.fy))
+    yaw, pitch = np.arctan(pixels / (matrix[0, 0], matrix[1, 1]))
     across = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
     down = np.array([[1, 0, 0], [0, np.cos(pitch), np.sin(pitch)], [0, -np.sin(pitch), np.cos(pitch)]])
-    return matrix @ across @ down @ np.linalg.inv(matrix)
+    return matrix @ across @ down @ inverse
+
+
+@functools.cache
+def _window() -> np.ndarray:
+    """Squared, a Hann window leaves more of what enters and leaves out."""
+    return cv2.createHanningWindow(_VIEW_SIZE, cv2.CV_32F) ** 2
+
+
+@functools.lru_cache(maxsize=8)
+def _camera(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """(3, 3) calibration matrix of the assumed camera, and its inverse."""
+    camera = prior_intrinsics(width, height)
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    return matrix, np.linalg.inv(matrix)

@@ -10,7 +10,7 @@ import pytest
 from moving_card import HEIGHT, WIDTH, MovingCard, texture
 
 from labeling.between_looks import cut_at_border
-from labeling.carrying import carry, close_gap, interpolate_gap, small_grey
+from labeling.carrying import carry, close_gaps, interpolate_gaps, small_grey
 from labeling.efforts import EFFORTS, Effort, straight_gap
 from labeling.errors import ConfigError, ModelError
 from labeling.extraction import label_with, without_doubles
@@ -50,7 +50,7 @@ def test_nothing_is_shown_long_after_it_was_seen() -> None:
     path = [scene.label(frame) for frame in range(0, 13, 3)]
     end = scene.label(12)
     end.points[:12], end.point_source[:12] = 0, 0
-    labels = close_gap(path, end)
+    labels = close_gaps([path], [end])
     assert [label.frame for label in labels] == list(range(1, 12))
     assert [bool(label.points[0, 2] > 0) for label in labels] == [True] * 6 + [False] * 5
     assert all(label.points[23, 2] > 0 for label in labels)
@@ -514,14 +514,14 @@ def moved(label: Keypoints, frame: int, shift: float) -> Keypoints:
 def test_the_miss_is_spread_over_the_way() -> None:
     start = MovingCard(speed=0).label(0)
     path = [start, *(moved(start, t, 2.0 * t) for t in range(1, 5))]  # drifts by 2 px a frame
-    between = close_gap(path, moved(start, 4, 4.0))  # it really moved by 1 px a frame
+    between = close_gaps([path], [moved(start, 4, 4.0)])  # it really moved by 1 px a frame
     assert [round(float(label.points[0, 0] - start.points[0, 0]), 3) for label in between] == [1.0, 2.0, 3.0]
 
 
 def test_a_far_miss_is_interpolated_instead() -> None:
     start = MovingCard(speed=0).label(0)
     path = [start, moved(start, 1, 50.0), moved(start, 2, 100.0)]
-    (between,) = close_gap(path, moved(start, 2, 10.0))
+    (between,) = close_gaps([path], [moved(start, 2, 10.0)])
     assert (between.point_source == POINT_INTERPOLATED).all()
     assert between.points[:, 0] == pytest.approx(start.points[:, 0] + 5)
 
@@ -530,14 +530,14 @@ def test_points_that_one_end_lacks_are_not_made_up() -> None:
     start = MovingCard(speed=0).label(0)
     end = moved(start, 4, 8.0)
     end.points[3] = 0
-    assert all(label.points[3, 2] == 0 for label in interpolate_gap(start, end))
+    assert all(label.points[3, 2] == 0 for label in interpolate_gaps([start], [end]))
 
 
 def test_a_gap_is_crossed_on_straight_lines() -> None:
     start = MovingCard(speed=0).label(5)
     end = replace(moved(start, 9, 8.0), score=start.score / 2, box_xyxy=start.box_xyxy + 12)
     end.points[::2, 2] /= 2
-    between = interpolate_gap(start, end)
+    between = interpolate_gaps([start], [end])
     assert [label.frame for label in between] == [6, 7, 8]
     for label, share in zip(between, (0.25, 0.5, 0.75), strict=True):
         np.testing.assert_allclose(label.points[:, :2], start.points[:, :2] + (8 * share, 0), atol=1e-4)
@@ -546,7 +546,7 @@ def test_a_gap_is_crossed_on_straight_lines() -> None:
         np.testing.assert_allclose(label.box_xyxy, start.box_xyxy + 12 * share, atol=1e-4)
         assert label.score == pytest.approx(start.score * (1 - share / 2), abs=1e-6)
         assert (label.point_source == POINT_INTERPOLATED).all()
-    assert interpolate_gap(start, replace(end, frame=6)) == []
+    assert interpolate_gaps([start], [replace(end, frame=6)]) == []
 
 
 def test_unknown_extractors_are_named() -> None:
