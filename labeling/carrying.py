@@ -75,12 +75,12 @@ def carry(previous: np.ndarray, current: np.ndarray, labels: Sequence[Keypoints]
     end[used], good[used] = _follow(previous, current, start[used])
     scales, shifts = _shared_motion(start, end, good)
     followed = (good.sum(axis=1) >= _MIN_CORNERS) & (good.sum(axis=1) >= _MIN_FOLLOWED_SHARE * counts)
-    return [
-        Carried(
-            label=_moved(label, float(scales[i]), shifts[i], end[i], good[i], frame=frame), followed=bool(followed[i])
-        )
-        for i, label in enumerate(labels)
-    ]
+    carried: dict[int, Keypoints] = {}
+    for schema in {label.schema for label in labels}:
+        rows = [i for i, label in enumerate(labels) if label.schema == schema]
+        moved = _moved([labels[i] for i in rows], scales[rows], shifts[rows], end[rows], good[rows], frame=frame)
+        carried |= zip(rows, moved, strict=True)
+    return [Carried(label=carried[i], followed=bool(followed[i])) for i in range(len(labels))]
 
 
 def close_gaps(paths: Sequence[Sequence[Keypoints]], ends: Sequence[Keypoints]) -> list[Keypoints]:
@@ -245,17 +245,31 @@ def _shared_motion(start: np.ndarray, end: np.ndarray, good: np.ndarray) -> tupl
 
 
 def _moved(
-    label: Keypoints, scale: float, shift: np.ndarray, end: np.ndarray, good: np.ndarray, *, frame: int
-) -> Keypoints:
-    points, source = label.points.copy(), label.point_source.copy()
-    present = label.present
-    count = int(present.sum())
-    points[present, :2] = points[present, :2] * scale + shift
-    if label.category == "person":
+    labels: Sequence[Keypoints], scales: np.ndarray, shifts: np.ndarray, ends: np.ndarray, good: np.ndarray, *,
+    frame: int,
+) -> list[Keypoints]:  # fmt: skip
+    """Objects of one schema after their (N,) ``scales`` and (N, 2) ``shifts``, of whose points (N, P, 2) ``ends`` are
+    where those that were followed came to."""
+    points = np.array([label.points for label in labels])
+    present = points[..., 2] > 0
+    places = points[..., :2] * scales[:, None, None] + shifts[:, None]
+    if labels[0].category == "person":
         # A joint that slipped along an edge returns to its start and is wrong all the same: the body bounds it.
-        slack = _LIMB_SLACK * abs(frame - label.frame) * box_diagonal(label.box_xyxy) + 0.25
-        own = good[:count] & (np.linalg.norm(end[:count] - points[present, :2], axis=1) <= slack)
-        points[np.flatnonzero(present)[own], :2] = end[:count][own]
-    source[present] = POINT_CARRIED
-    box = (label.box_xyxy.reshape(2, 2) * scale + shift).reshape(4).astype(np.float32)
-    return replace(label, frame=frame, points=points, point_source=source, box_xyxy=box)
+        diagonals = np.array([box_diagonal(label.box_xyxy) for label in labels])
+        slack = _LIMB_SLACK * np.array([abs(frame - label.frame) for label in labels]) * diagonals + 0.25
+        own = np.arange(ends.shape[1]) < present.sum(axis=1)[:, None]
+        came_to = np.zeros_like(places)
+        came_to[present] = ends[own]
+        found = np.zeros_like(present)
+        found[present] = good[own]
+        near = found & (np.linalg.norm(came_to - places, axis=2) <= slack[:, None])
+        places[near] = came_to[near]
+    points[..., :2] = np.where(present[..., None], places, points[..., :2])
+    boxes = np.array([label.box_xyxy for label in labels]).reshape(-1, 2, 2) * scales[:, None, None] + shifts[:, None]
+    return [
+        replace(
+            label, frame=frame, points=points[i], box_xyxy=boxes[i].reshape(4).astype(np.float32),
+            point_source=np.where(present[i], np.int8(POINT_CARRIED), label.point_source),
+        )
+        for i, label in enumerate(labels)
+    ]  # fmt: skip

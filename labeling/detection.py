@@ -183,11 +183,11 @@ def suppress_overlaps(boxes_xyxy: np.ndarray, labels: np.ndarray, iou_threshold:
     Returns:
         Indices of the boxes that stay, best first.
     """
-    double = (iou(boxes_xyxy, boxes_xyxy) > iou_threshold) & (labels[:, None] == labels)
+    double = np.triu((iou(boxes_xyxy, boxes_xyxy) > iou_threshold) & (labels[:, None] == labels), 1)
     alive = np.ones(len(boxes_xyxy), bool)
-    for i in range(len(boxes_xyxy)):
+    for i in np.flatnonzero(double.any(axis=1)):
         if alive[i]:
-            alive[i + 1 :] &= ~double[i, i + 1 :]
+            alive &= ~double[i]
     return np.flatnonzero(alive)
 
 

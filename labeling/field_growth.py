@@ -190,7 +190,9 @@ def read_map(index: MapIndex, kind: int, x: float, y: float) -> float:
             exponent = squared * index.entries[m, 2]
             if exponent <= _CUT:
                 total += index.entries[m, 3] * math.exp(-exponent)
-    return 1.0 if total > 1 else total
+                if total >= 1:
+                    return 1.0
+    return total
 
 
 @njit(cache=True)

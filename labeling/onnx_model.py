@@ -128,12 +128,18 @@ class OnnxModel:
                     f"{self.card.name} gave {_show(output.shape)} in {name!r} for a batch of {len(chunk)}, not "
                     f"{_show(wanted)}; export {self.path} with the shapes that it states, or with a fixed batch of 1"
                 )
-            if not np.isfinite(output).all():
+            if not _all_finite(output):
                 raise ModelError(
                     f"{self.card.name} gave NaN or infinity in {name!r}; check the file {self.path} and its precision "
                     "(fp16 overflows)"
                 )
         return [output[:count] for output in outputs]
+
+
+def _all_finite(values: np.ndarray) -> bool:
+    """Whether there is no NaN and no infinity, which a sum would not survive; one that overflows says nothing."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
 
 
 def resolve_providers(providers: Sequence[str]) -> list[str]:

@@ -6,6 +6,7 @@ a narrow fit agree within the noise the wide one is taken, which is how a parked
 (the intersection of confidence intervals of Goldenshluger and Nemirovski 1997, for two windows).
 """
 
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -59,7 +60,7 @@ def smooth_tracks(
     groups: dict[tuple[int, str, int], list[Keypoints]] = {}
     ordered = sorted(breaks)
     for label in labels:
-        part = int(np.searchsorted(ordered, label.frame, side="right"))
+        part = bisect_right(ordered, label.frame)
         groups.setdefault((label.track_id, label.schema, part), []).append(label)
     smoothed = [label for group in groups.values() for label in _smooth_track(group, settings)]
     return sorted(smoothed, key=lambda label: (label.frame, label.track_id))
@@ -186,30 +187,30 @@ def _local_fit(positions, weights, half_width):
         half_width: frames on either side.
     """
     length, count, _ = positions.shape
+    # Side by side in memory, so that the innermost loop does all points at once: weights, and weighted x and y.
+    weighted = np.empty((length, 3, count))
+    weighted[:, 0], weighted[:, 1], weighted[:, 2] = weights, weights * positions[..., 0], weights * positions[..., 1]
+    channels = weighted.reshape(length, 3 * count)
+    away = np.arange(-half_width, half_width + 1) / (half_width + 1)
+    tricube = (1 - np.abs(away) ** 3) ** 3
+    moments = np.empty((5, 3 * count))
     fitted = np.zeros_like(positions)
     for t in range(length):
-        first, last = max(0, t - half_width), min(length - 1, t + half_width)
+        moments[:] = 0
+        for s in range(max(0, t - half_width), min(length - 1, t + half_width) + 1):
+            tap = tricube[s - t + half_width]
+            for power in range(5):
+                for c in range(3 * count):
+                    moments[power, c] += tap * channels[s, c]
+                tap *= away[s - t + half_width]
         for k in range(count):
-            m0 = m1 = m2 = m3 = m4 = 0.0
-            x0 = x1 = x2 = y0 = y1 = y2 = 0.0
-            for s in range(first, last + 1):
-                u = (s - t) / (half_width + 1)
-                w = weights[s, k] * (1 - abs(u) ** 3) ** 3
-                wu = w * u
-                wuu = wu * u
-                m0 += w
-                m1 += wu
-                m2 += wuu
-                m3 += wuu * u
-                m4 += wuu * u * u
-                x, y = positions[s, k, 0], positions[s, k, 1]
-                x0, x1, x2 = x0 + w * x, x1 + wu * x, x2 + wuu * x
-                y0, y1, y2 = y0 + w * y, y1 + wu * y, y2 + wuu * y
+            m0, m1, m2, m3, m4 = moments[0, k], moments[1, k], moments[2, k], moments[3, k], moments[4, k]
             # A little ridge on slope and bend: with too few frames for them (the ends of a track) the fit falls back to
             # a mean. The first unknown of the normal equations by Cramer's rule.
             a, d, f = m0 + 1e-9, m2 + 1e-3, m4 + 2e-3
             c0, c1, c2 = d * f - m3 * m3, m2 * m3 - m1 * f, m1 * m3 - m2 * d
             determinant = a * c0 + m1 * c1 + m2 * c2
-            fitted[t, k, 0] = (c0 * x0 + c1 * x1 + c2 * x2) / determinant
-            fitted[t, k, 1] = (c0 * y0 + c1 * y1 + c2 * y2) / determinant
+            for axis in range(2):
+                c = (axis + 1) * count + k
+                fitted[t, k, axis] = (c0 * moments[0, c] + c1 * moments[1, c] + c2 * moments[2, c]) / determinant
     return fitted
