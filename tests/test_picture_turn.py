@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from labeling import picture_turn as module
 from labeling.camera import prior_intrinsics
-from labeling.picture_turn import picture_turn, turn_view
+from labeling.picture_turn import TurnMeter, picture_turn, turn_view
 
 WIDTH, HEIGHT = 528, 352
 
@@ -48,3 +49,37 @@ def test_views_can_be_compared_again() -> None:
     first = picture_turn(before, after, width=WIDTH, height=HEIGHT)
     assert np.array_equal(before, kept[0]) and np.array_equal(after, kept[1])
     assert np.array_equal(picture_turn(before, after, width=WIDTH, height=HEIGHT), first)
+
+
+def test_a_meter_tells_the_turn_since_any_moment_that_it_measured() -> None:
+    """A panorama shown further on, in steps of 6, 10 and 2 px: each kind of look has moments of its own. A pixel of the
+    small views is four of the frame: each step is within half of one."""
+    noise = np.random.default_rng(5).integers(0, 256, (HEIGHT // 8, WIDTH // 4, 3), dtype=np.uint8)
+    panorama = cv2.resize(noise, (2 * WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    meter = TurnMeter()
+    for moment, place in {0: 0, 3: 6, 4: 16, 8: 18}.items():
+        meter.reach(panorama[:, place : place + WIDTH], moment)
+    middle = np.array([WIDTH / 2, HEIGHT / 2, 1])
+    for moment, wanted in {0: -18, 3: -12, 4: -2, 8: 0}.items():
+        x, y, scale = meter.since(moment) @ middle
+        assert x / scale - WIDTH / 2 == pytest.approx(wanted, abs=2.0) and y / scale == pytest.approx(HEIGHT / 2, abs=1)
+
+
+def test_a_moment_is_measured_once_and_nothing_is_due_that_nobody_began(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    calls: list[int] = []
+
+    def counted(before: np.ndarray, after: np.ndarray, **size: int) -> np.ndarray:
+        calls.append(len(calls))
+        return picture_turn(before, after, **size)
+
+    monkeypatch.setattr(module, "picture_turn", counted)
+    meter = TurnMeter(max_step=4)
+    assert not meter.due(9)
+    meter.reach(frame, 9)
+    assert not meter.due(12) and meter.due(13) and calls == []
+    for _ in range(3):
+        meter.reach(frame, 13)
+    assert len(calls) == 1 and not meter.due(16)
+    meter.forget()
+    assert not meter.due(99) and np.array_equal(meter.since(9), np.eye(3))
