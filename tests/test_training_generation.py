@@ -1,7 +1,7 @@
 """The two-stage generator: conditions, seeds, hand-over of latents, recipes for ego-motion, clear answers."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -349,7 +349,9 @@ def test_a_killed_repeat_leaves_no_record_beside_other_videos(generator, tmp_pat
     monkeypatch.setattr(generator, "sample", killed)
     with pytest.raises(KeyboardInterrupt):
         write_samples(generator, conditions, out=tmp_path, name="v_0", samples=3, seed=1, settings=fast)
-    assert sorted(path.name for path in tmp_path.glob("v_0*")) == ["v_0_0.mp4", "v_0_1_0.mp4"]
+    assert sorted(path.name for path in tmp_path.glob("v_0*")) == ["v_0.json", "v_0_0.mp4", "v_0_1_0.mp4"]
+    told = json.loads((tmp_path / "v_0.json").read_text())
+    assert (told["unfinished"], told["seed"], told["samples"]) == (True, 1, 3)
     monkeypatch.undo()
     write_samples(generator, conditions, out=tmp_path, name="v_0", samples=3, seed=1, settings=fast)
     still = ClipConditions(image=IMAGE, caption="x", first_control=SKELETON)
@@ -357,6 +359,27 @@ def test_a_killed_repeat_leaves_no_record_beside_other_videos(generator, tmp_pat
     for folder, kept in ((tmp_path, ["v_0_0.mp4", "v_0_1_0.mp4"]), (tmp_path / "skeleton", ["v_0_0.mp4"])):
         assert sorted(path.name for path in folder.glob("*.mp4")) == kept
     assert not list((tmp_path / "conditions").iterdir()), "this one was asked for no trajectory"
+
+
+def test_what_a_killed_first_run_made_is_not_taken_for_the_next_one_s(generator, tmp_path: Path, monkeypatch) -> None:
+    fast = SamplingSettings(steps=1, guidance=1.0)
+    still = ClipConditions(image=IMAGE, caption="x", first_control=SKELETON)
+    driven = replace(still, trajectory=ego_trajectory("straight 5m/s", frames=9, fps=24))
+    real = generator.sample
+
+    def killed(*given: Any, number: int, **named: Any) -> Any:
+        if number == 2:
+            raise KeyboardInterrupt
+        return real(*given, number=number, **named)
+
+    monkeypatch.setattr(generator, "sample", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_samples(generator, driven, out=tmp_path, name="v_0", samples=3, seed=5, settings=fast)
+    monkeypatch.undo()
+    write_samples(generator, still, out=tmp_path, name="v_0", samples=1, settings=fast)
+    found = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*"))
+    assert found == ["skeleton/v_0_0.mp4", "v_0.json", "v_0_0.mp4"]
+    assert "unfinished" not in json.loads((tmp_path / "v_0.json").read_text())
 
 
 def test_a_clip_is_made_again_when_the_trajectory_file_changes(generator, tmp_path: Path) -> None:
