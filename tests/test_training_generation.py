@@ -66,6 +66,16 @@ def generator(adapters: dict[Stage, Path]) -> ClipGenerator:
     return ClipGenerator(backbone, motion=adapters["motion"], appearance=adapters["appearance"])
 
 
+def packed_clip() -> Any:
+    """A clip of nine frames, as a job's shards give it."""
+    meta = {
+        "picture": {"width": WIDTH, "height": HEIGHT}, "intrinsics": asdict(prior_intrinsics(WIDTH, HEIGHT)), "fps": 24
+    }  # fmt: skip
+    sample: Any = FakeSample(key="v_0", meta=meta)
+    sample.members, sample.iterate_frames = {}, lambda suffix: iter(sample.frames(suffix))
+    return sample
+
+
 def two_stages(adapters: dict[Stage, Path]) -> dict[str, Any]:
     return {"motion": adapters["motion"], "appearance": adapters["appearance"]}
 
@@ -383,11 +393,7 @@ def test_what_a_killed_first_run_made_is_not_taken_for_the_next_one_s(generator,
 
 
 def test_a_clip_is_made_again_when_the_trajectory_file_changes(generator, tmp_path: Path) -> None:
-    meta = {
-        "picture": {"width": WIDTH, "height": HEIGHT}, "intrinsics": asdict(prior_intrinsics(WIDTH, HEIGHT)), "fps": 24
-    }  # fmt: skip
-    sample: Any = FakeSample(key="v_0", meta=meta)
-    sample.members, sample.iterate_frames = {}, lambda suffix: iter(sample.frames(suffix))
+    sample = packed_clip()
     request = ClipsRequest(ego=str(tmp_path / "drive.tum"))
     options = GenerateOptions(steps=1, guidance=1.0)
 
@@ -399,6 +405,38 @@ def test_a_clip_is_made_again_when_the_trajectory_file_changes(generator, tmp_pa
         return _make(generator, sample, request, out=tmp_path / "o", options=options, settings=settings, adapters={})
 
     assert [made(speed) for speed in (0.1, 0.1, 2.0, 2.0)] == [True, False, True, False]
+
+
+@pytest.mark.parametrize("gone", ["v_0_1.mp4", "skeleton/v_0_1.mp4", "conditions/v_0.tum", "v_0.json"])
+def test_a_clip_is_made_again_when_one_of_its_files_is_gone(generator, tmp_path: Path, gone: str) -> None:
+    def made() -> bool:
+        return _make(
+            generator, packed_clip(), ClipsRequest(), out=tmp_path, adapters={}, settings=SamplingSettings(steps=1),
+            options=GenerateOptions(samples=2, steps=1),
+        )  # fmt: skip
+
+    assert (made(), made()) == (True, False)
+    (tmp_path / gone).unlink()
+    assert made() and (tmp_path / gone).is_file() and not made()
+
+
+@pytest.mark.parametrize("asked", [ClipsRequest(ego="still", true_skeletons=True), ClipsRequest(object_variant=0)])
+def test_a_clip_s_own_views_are_not_wanted_beyond_its_end(generator, tmp_path: Path, asked: ClipsRequest) -> None:
+    """What lies beyond it would be drawn black, as if nothing were there."""
+    longer = ClipGenerator(
+        load_backbone(generator.backbone.config), motion=generator.motion, appearance=generator.appearance, frames=17
+    )
+    with pytest.raises(ConfigError, match="v_0 has 9 frames, but its own skeletons or objects are wanted in 17"):
+        _make(
+            longer, packed_clip(), asked, out=tmp_path, adapters={}, settings=SamplingSettings(steps=1),
+            options=GenerateOptions(steps=1),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("frames", [0, -7])
+def test_no_frames_are_not_taken_for_the_usual_ones(generator, frames: int) -> None:
+    with pytest.raises(ConfigError, match=f"--frames {frames} leaves nothing"):
+        ClipGenerator(generator.backbone, motion=generator.motion, frames=frames)
 
 
 def test_the_record_of_one_clip_tells_what_it_was_made_of(adapters, tmp_path: Path) -> None:
