@@ -4,6 +4,7 @@ import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,16 +21,19 @@ from dataset.street import StreetConfig, write_street_video
 from labeling.camera import rebased_trajectory, write_tum
 from labeling.encoding import VideoWriter, lossless_rgb
 from labeling.errors import ConfigError, DataError, ModelError
+from labeling.extractors import ExtractorChoice
+from labeling.model_cards import load_cards
 from labeling.object_video import chosen_tracks
 from pipelines.cli import app
 from pipelines.config import Config, merged
 from pipelines.evaluate import EvaluateOptions, Evaluation, evaluate
 from pipelines.evaluate_console import coverage_table, figure_table
 from pipelines.evaluate_notes import blind_ruler, clip_notes, record_notes, ruler_notes
+from pipelines.evaluate_ruler import Ruler
 from pipelines.generate_clips import ClipsRequest, chosen_clips, generate_clips
 from pipelines.job import Job
 from pipelines.sources import Source
-from training.evaluation_estimates import LEAST_CONFIDENCE, clip_truth, ego_fault
+from training.evaluation_estimates import LEAST_CONFIDENCE, EstimateSettings, clip_truth, ego_fault
 from training.evaluation_files import SampleFolder, find_samples, sample_name, shown_frames, video_rate
 from training.evaluation_report import FLOOR, HELD, SAMPLES, TRUE_SKELETONS, VELOCITY
 
@@ -317,11 +321,27 @@ def test_objects_are_judged_by_the_tracks_that_the_samples_could_be_given(tmp_pa
     (tmp_path / "v_0.json").write_text('{"made by": "others"}')
     assert shown_frames(tmp_path / "v_0.json") is None and shown_frames(tmp_path / "none.json") is None
     assert max(clip_truth(sample).box_tracks) > 8, "without a record, the whole clip"
-    from labeling.extractors import ExtractorChoice
-
     assert record_notes(["v_0"], ["v_0"], ExtractorChoice()) == [], "no boxes are judged"
     choice: Any = SimpleNamespace(cards=["one"])
     assert "1 of 2 clips have no record" in record_notes(["v_0", "w_0"], ["v_0"], choice)[0]
+
+
+@pytest.mark.parametrize("change", ["card", "weights"])
+def test_what_was_found_with_another_card_or_other_weights_is_looked_at_again(tmp_path: Path, change: str) -> None:
+    shipped: Any = load_cards()["street_detector"]
+    card = shipped.model_copy(update={"name": "mine", "file": "mine.onnx", "sha256": None})
+    ruler = Ruler(
+        choice=ExtractorChoice(detector=card), models_dir=tmp_path, settings=EstimateSettings(), seconds=None,
+        object_variant=0,
+    )  # fmt: skip
+    (tmp_path / "mine.onnx").write_bytes(b"one export")
+    before = ruler.as_json()
+    assert before == ruler.as_json()
+    if change == "card":
+        ruler = replace(ruler, choice=ExtractorChoice(detector=card.model_copy(update={"score_threshold": 0.6})))
+    else:
+        (tmp_path / "mine.onnx").write_bytes(b"another export")
+    assert ruler.as_json() != before
 
 
 def motion(**changes: Any) -> Any:
@@ -365,8 +385,6 @@ def test_notes_say_what_was_left_out() -> None:
     notes = " | ".join(clip_notes({"a_0": "val", "b_0": "val", "t_0": "train"}, {SAMPLES: folder}, 6))
     for words in ("1 of 2 held-out", "1 clips are of the training split, such as t_0", "x.mp4", "3 samples beyond 6"):
         assert words in notes
-    from labeling.extractors import ExtractorChoice
-
     assert "neither boxes nor points" in ruler_notes(ExtractorChoice(), None)[0]
     assert "imported" in ruler_notes(ExtractorChoice(), Path("t"))[-1]
 
