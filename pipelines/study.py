@@ -130,9 +130,13 @@ def run_study(
 
     plan = plan_study(quick=quick) if minutes is None else plan_study(minutes, quick=quick)
     study = Study(plan=plan, out=out, say=say)
+    _refuse_other_plan(study)
+    if report:
+        # What has nothing to report claims no folder.
+        _complete_seeds(study)
     try_folder(out)
     with storage_errors(out):
-        _claim(study)
+        atomic_write(_plan_file(study), _plan_text(study).encode())
         if not report:
             prepare(study)
             for seed in range(plan.scale.seeds):
@@ -165,12 +169,19 @@ def show_study(out: Path, *, minutes: float | None, quick: bool, report: bool) -
     return 0
 
 
-def _claim(study: Study) -> None:
+def _plan_file(study: Study) -> Path:
+    return study.out / "plan.json"
+
+
+def _plan_text(study: Study) -> str:
+    return json.dumps(asdict(study.plan), indent=1, sort_keys=True) + "\n"
+
+
+def _refuse_other_plan(study: Study) -> None:
     """Refuse a folder of another plan: its parts would be mixed."""
-    path, told = study.out / "plan.json", json.dumps(asdict(study.plan), indent=1, sort_keys=True) + "\n"
-    if path.is_file() and path.read_text(encoding="utf-8") != told:
+    path = _plan_file(study)
+    if path.is_file() and path.read_text(encoding="utf-8") != _plan_text(study):
         raise ConfigError(f"{study.out} holds a study of another plan; give another --out, or the budget it began with")
-    atomic_write(path, told.encode())
 
 
 def prepare(study: Study) -> None:
