@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from dataset.loader import Sample, ShardDataset
 from dataset.street import StreetConfig, write_street_video
 from labeling.camera import rebased_trajectory, write_tum
 from labeling.encoding import VideoWriter, lossless_rgb
-from labeling.errors import ConfigError, DataError, ModelError
+from labeling.errors import ConfigError, DataError, ModelError, VideoError
 from labeling.extractors import ExtractorChoice
 from labeling.model_cards import load_cards
 from labeling.object_video import chosen_tracks
@@ -34,7 +35,7 @@ from pipelines.generate_clips import ClipsRequest, chosen_clips, generate_clips
 from pipelines.job import Job
 from pipelines.sources import Source
 from training.evaluation_estimates import LEAST_CONFIDENCE, EstimateSettings, clip_truth, ego_fault
-from training.evaluation_files import SampleFolder, find_samples, sample_name, shown_frames, video_rate
+from training.evaluation_files import SampleFolder, find_samples, read_sample, sample_name, shown_frames, video_rate
 from training.evaluation_report import FLOOR, HELD, SAMPLES, TRUE_SKELETONS, VELOCITY
 
 WIDTH, HEIGHT, CLIP = 288, 192, 17
@@ -301,6 +302,23 @@ def test_the_first_samples_count_in_the_order_of_their_numbers(tmp_path: Path) -
     assert [one.number for one in folder.by_key["a_0"]] == [0, 1, 2, 3]
     assert (folder.beyond, folder.strangers) == (2, ())
     assert video_rate(np.arange(11) / 10) == pytest.approx(10) and video_rate([0.0]) == 0
+
+
+@pytest.mark.parametrize("fps", [1, 2, 4])
+def test_slow_videos_are_whole_and_one_that_lacks_a_frame_is_not(tmp_path: Path, fps: int) -> None:
+    """Two keyframes a second are what many driving models give: no step of them is a hole."""
+    frames = np.random.default_rng(0).integers(0, 256, (9, 48, 64, 3), dtype=np.uint8)
+    path = write(tmp_path / "whole.mp4", frames, fps=fps)
+    video = read_sample(path)
+    assert len(video.frames) == 9 and video.times_s == pytest.approx(np.arange(9) / fps)
+    with av.open(path) as whole, av.open(tmp_path / "torn.mp4", "w") as torn:
+        stream = torn.add_stream_from_template(whole.streams.video[0])
+        for number, packet in enumerate(whole.demux(video=0)):
+            if packet.dts is not None and number != 4:
+                packet.stream = stream
+                torn.mux(packet)
+    with pytest.raises(VideoError, match="of 8 frames decode"):
+        read_sample(tmp_path / "torn.mp4")
 
 
 def test_objects_are_judged_by_the_tracks_that_the_samples_could_be_given(tmp_path: Path) -> None:
