@@ -11,6 +11,7 @@ from labeling.extraction import Effort
 from labeling.extractors import ExtractorChoice, choose_extractors
 from labeling.model_cards import ModelCard, find_weights
 from labeling.onnx_files import weights_sha256
+from labeling.timeline import FPS
 from pipelines.config import EFFORTS
 from pipelines.job import open_job
 from training.evaluation_estimates import EstimateSettings
@@ -98,7 +99,9 @@ def check_options(options: EvaluateOptions) -> None:
     """
     if options.effort is not None and options.effort not in EFFORTS:
         raise ConfigError(f"effort {options.effort!r} is not known; choose one of {', '.join(EFFORTS)}")
-    if options.seconds is not None and not options.seconds > 0:
-        raise ConfigError(f"--seconds {options.seconds:g} leaves nothing to compare; give a positive duration")
+    if options.seconds is not None and not options.seconds * FPS >= 1:
+        raise ConfigError(
+            f"--seconds {options.seconds:g} leaves nothing to compare; give a frame's duration, 1/{FPS} s, at least"
+        )
     if options.samples_per_clip < 1 or options.every < 1:
         raise ConfigError("--samples-per-clip and --every count from 1; give at least 1")

@@ -34,8 +34,16 @@ from pipelines.evaluate_ruler import Ruler
 from pipelines.generate_clips import ClipsRequest, chosen_clips, generate_clips
 from pipelines.job import Job
 from pipelines.sources import Source
-from training.evaluation_estimates import LEAST_CONFIDENCE, EstimateSettings, clip_truth, ego_fault
-from training.evaluation_files import SampleFolder, find_samples, read_sample, sample_name, shown_frames, video_rate
+from training.evaluation_estimates import LEAST_CONFIDENCE, ClipEstimator, EstimateSettings, clip_truth, ego_fault
+from training.evaluation_files import (
+    SampleFiles,
+    SampleFolder,
+    find_samples,
+    read_sample,
+    sample_name,
+    shown_frames,
+    video_rate,
+)
 from training.evaluation_report import FLOOR, HELD, SAMPLES, TRUE_SKELETONS, VELOCITY
 
 WIDTH, HEIGHT, CLIP = 288, 192, 17
@@ -144,6 +152,13 @@ def test_what_fails_is_counted_with_its_reason(found: Evaluation) -> None:
     assert figures(found, SAMPLES)["min_ade_m"] < 0.15, "the best of those that were estimated"
 
 
+def test_a_picture_too_small_to_be_compared_is_a_fault(clip: Sample, tmp_path: Path) -> None:
+    path = write(tmp_path / "avenue_0_0.mp4", [cv2.resize(frame, (2, 2)) for frame in clip.frames("rgb.mp4")])
+    looker = ClipEstimator(clip, clip_truth(clip), extractors=None)
+    found = looker.estimate(SampleFiles(rgb=path))
+    assert found.readable and found.faults["picture"] == "pictures of 2x2 are too small to be compared"
+
+
 def test_each_sample_is_judged_at_its_own_rate_and_size(found: Evaluation) -> None:
     assert dict(found.report.sets[SAMPLES].geometries) == {
         "288x192 at 24 fps, 17 frames": 3, "192x128 at 12 fps, 9 frames": 1,
@@ -163,12 +178,14 @@ def test_a_second_run_looks_at_nothing_again_and_a_changed_sample_is_seen(
     monkeypatch.setattr(module, "_evaluate_clip", lambda task: looked.append(task.sample.key) or perfect.results[0])
     with (perfect.file.parent / "clips.jsonl").open("a") as stream:
         stream.write('{"stamp": "torn')
+    kept = perfect.file.parent / "clips.jsonl"
+    kept.write_bytes(b"\xff\xfe damaged\n" + kept.read_bytes())
     assert evaluate(job, folder, OPTIONS).report == perfect.report and not looked
     assert perfect.file.read_bytes() == before
     evaluate(job, folder, EvaluateOptions(every=4))
     assert looked == ["avenue_0"]
-    lines = (perfect.file.parent / "clips.jsonl").read_text().splitlines()
-    assert len(lines) == 3 and json.loads(lines[2])["result"]["key"] == "avenue_0", "a torn line swallows no other"
+    lines = kept.read_bytes().splitlines()
+    assert len(lines) == 4 and json.loads(lines[3])["result"]["key"] == "avenue_0", "a torn line swallows no other"
 
 
 @pytest.mark.parametrize("workers", [0, 1, 4])
@@ -265,6 +282,8 @@ def test_folders_without_samples_are_errors(job: Path, mixed: Path, tmp_path: Pa
     [
         ({"effort": "great"}, ConfigError, "effort 'great' is not known"),
         ({"seconds": 0.0}, ConfigError, "leaves nothing to compare"),
+        ({"seconds": 0.04}, ConfigError, "leaves nothing to compare; give a frame's duration, 1/24 s, at least"),
+        ({"seconds": float("nan")}, ConfigError, "leaves nothing to compare"),
         ({"every": 0}, ConfigError, "at least 1"),
         ({"extractors": ("nobody",)}, ConfigError, "no model card"),
         ({"extractors": ("rtmpose_m",)}, ModelError, "weights"),
