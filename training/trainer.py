@@ -166,7 +166,15 @@ class Trainer:
                 "--out to train on these"
             )
         restore(checkpoint, self.backbone.denoiser, self.optimiser, self.names, adapter=self.config.stage)
+        if self.accelerator.is_main_process:
+            self._put_adapter((checkpoint / ADAPTER).read_bytes())
         return state.step
+
+    def _put_adapter(self, adapter: bytes) -> None:
+        """The adapter beside the checkpoints: a kill, or a full disk, between the two leaves an earlier one or none."""
+        path = self.out / ADAPTER
+        if not path.is_file() or path.read_bytes() != adapter:
+            atomic_write(path, adapter)
 
     def _loader(self, start_step: int) -> DataLoader:
         # The order is a function of the step alone: how far a loader got differs from process to process.
@@ -292,7 +300,7 @@ class Trainer:
         save_checkpoint(self.out / "checkpoints", self.step, files, keep=self.config.checkpoint.keep)
         adapter = files[ADAPTER]
         assert isinstance(adapter, bytes)
-        atomic_write(self.out / ADAPTER, adapter)
+        self._put_adapter(adapter)
 
     def _validate(self, log: RunLog) -> dict[str, float]:
         values = held_out_losses(self.backbone, self.items, self.store, self.config, accelerator=self.accelerator)
