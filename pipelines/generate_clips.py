@@ -152,7 +152,7 @@ def _make(
     settings: SamplingSettings, adapters: Mapping[str, str],
 ) -> bool:  # fmt: skip
     """Make one clip's samples; False where they were there."""
-    caption = request.caption or sample.caption
+    caption = sample.caption if request.caption is None else request.caption
     about = {"adapters": dict(adapters)} | sample_facts(
         sample, ego=request.ego, true_skeletons=request.true_skeletons, object_variant=request.object_variant
     )

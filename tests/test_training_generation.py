@@ -1,6 +1,7 @@
 """The two-stage generator: conditions, seeds, hand-over of latents, recipes for ego-motion, clear answers."""
 
 import json
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -216,6 +217,11 @@ def test_trajectory_files_are_resampled_and_must_be_long_enough(tmp_path: Path) 
     assert found.cam_to_world[-1, 2, 3] == pytest.approx(10)
     with pytest.raises(ConfigError, match="lasts 2.90 s, the clip 5.00 s"):
         ego_trajectory(tmp_path / "drive.tum", frames=121, fps=24)
+    # By its rows, as `animatic ego --import` reads it, whatever its name.
+    shutil.copy(tmp_path / "drive.tum", tmp_path / "drive.txt")
+    assert np.array_equal(ego_trajectory(tmp_path / "drive.txt", frames=25, fps=24).cam_to_world, found.cam_to_world)
+    np.savetxt(tmp_path / "kitti.txt", poses[:, :3].reshape(-1, 12))
+    assert ego_trajectory(tmp_path / "kitti.txt", frames=9, fps=24).cam_to_world[-1, 2, 3] == pytest.approx(8)
     np.save(tmp_path / "drive.npy", poses)
     assert ego_trajectory(tmp_path / "drive.npy", frames=9, fps=24).cam_to_world[-1, 2, 3] == pytest.approx(8)
 
@@ -405,6 +411,15 @@ def test_a_clip_is_made_again_when_the_trajectory_file_changes(generator, tmp_pa
         return _make(generator, sample, request, out=tmp_path / "o", options=options, settings=settings, adapters={})
 
     assert [made(speed) for speed in (0.1, 0.1, 2.0, 2.0)] == [True, False, True, False]
+
+
+@pytest.mark.parametrize(("given", "used"), [(None, packed_clip().caption), ("Night.", "Night."), ("", "")])
+def test_a_caption_for_all_clips_may_be_empty(generator, tmp_path: Path, given: str | None, used: str) -> None:
+    _make(
+        generator, packed_clip(), ClipsRequest(caption=given), out=tmp_path, adapters={},
+        settings=SamplingSettings(steps=1), options=GenerateOptions(steps=1),
+    )  # fmt: skip
+    assert json.loads((tmp_path / "v_0.json").read_text())["caption"] == used
 
 
 @pytest.mark.parametrize("gone", ["v_0_1.mp4", "skeleton/v_0_1.mp4", "conditions/v_0.tum", "v_0.json"])
