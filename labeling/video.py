@@ -123,9 +123,12 @@ def probe(path: Path) -> VideoInfo:
 
 
 def source_frames(
-    path: Path, *, start_s: float = -math.inf, end_s: float = math.inf, deinterlace: bool = False, threads: int = 1
-) -> Iterator[SourceFrame]:
+    path: Path, *, start_s: float = -math.inf, end_s: float = math.inf, deinterlace: bool = False, threads: int = 1,
+    hole_s: float = HOLE_S,
+) -> Iterator[SourceFrame]:  # fmt: skip
     """Frames shown in ``[start_s, end_s)``, in order, as the decoder gives them; what does not decode is left out.
+
+    After a gap of more than ``hole_s`` frames are unclean, as after an error.
 
     Raises:
         VideoError: as ``probe``.
@@ -135,7 +138,7 @@ def source_frames(
         stream = pick_video_stream(container, path)
         stream.thread_count = threads
         packets = read_packets_from(container, stream, start_s)
-        frames = _decode(stream, packets)
+        frames = _decode(stream, packets, hole_s=hole_s)
         shown = _deinterlaced(frames) if deinterlace else frames
         for frame in shown:
             if frame.time_s >= end_s - SAME_TIME_S:
@@ -145,16 +148,19 @@ def source_frames(
 
 
 def decode_frames(
-    path: Path, *, start_s: float = -math.inf, end_s: float = math.inf, picture: PictureMap | None = None
-) -> Iterator[DecodedFrame]:
+    path: Path, *, start_s: float = -math.inf, end_s: float = math.inf, picture: PictureMap | None = None,
+    hole_s: float = HOLE_S,
+) -> Iterator[DecodedFrame]:  # fmt: skip
     """Upright frames shown in ``[start_s, end_s)``, in order, at their own size or mapped by ``picture``.
+
+    ``hole_s`` as for ``source_frames``.
 
     Raises:
         VideoError: as ``probe``.
     """
     info = probe(path)
     converter = _rgb_converter(info, picture)
-    for frame in source_frames(path, start_s=start_s, end_s=end_s, deinterlace=info.interlaced):
+    for frame in source_frames(path, start_s=start_s, end_s=end_s, deinterlace=info.interlaced, hole_s=hole_s):
         yield DecodedFrame(
             time_s=frame.time_s, is_clean=frame.is_clean, picture=frame.picture, converter=converter
         )  # fmt: skip
@@ -275,7 +281,9 @@ def _upright_turn_deg(frame: av.VideoFrame) -> int:
     return round(-frame.rotation / 90) * 90 % 360
 
 
-def _decode(stream: av.VideoStream, packets: Iterable[av.Packet | None]) -> Iterator[SourceFrame]:
+def _decode(
+    stream: av.VideoStream, packets: Iterable[av.Packet | None], *, hole_s: float = HOLE_S
+) -> Iterator[SourceFrame]:
     """Frames in the order they are shown. After an error, frames are unclean up to the next keyframe shown after it."""
     broken_at_s = -math.inf
     last_s = math.inf
@@ -296,7 +304,7 @@ def _decode(stream: av.VideoStream, packets: Iterable[av.Packet | None]) -> Iter
                 continue
             time_s = seconds(picture.pts, picture.time_base)
             # Lost packets need leave no other trace than the time that they should have filled.
-            if picture.is_corrupt or (time_s - last_s > HOLE_S and not picture.key_frame):
+            if picture.is_corrupt or (time_s - last_s > hole_s and not picture.key_frame):
                 clean = False
             elif picture.key_frame and time_s > broken_at_s:
                 clean = True

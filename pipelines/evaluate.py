@@ -234,16 +234,16 @@ def _parts(files: SampleFiles) -> list[Path]:
 
 
 class _KeptClips:
-    """Results by stamp, a line each in a file that only grows; a torn last line is ignored."""
+    """Results by stamp, a line each in a file that only grows; a line that is torn or damaged is ignored."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._found = path, dict[str, ClipResult]()
         self._torn = ""
         if path.is_file():
-            text = path.read_text(encoding="utf-8")
+            data = path.read_bytes()
             # A line that was being written when the process was killed must not swallow the next.
-            self._torn = "\n" if text and not text.endswith("\n") else ""
-            for line in text.splitlines():
+            self._torn = "\n" if data and not data.endswith(b"\n") else ""
+            for line in data.splitlines():
                 try:
                     values = json.loads(line)
                     self._found[values["stamp"]] = result_from_json(values["result"])

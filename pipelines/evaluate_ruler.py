@@ -5,9 +5,13 @@ from pathlib import Path
 from typing import Any, cast
 
 from dataset.layout import JOB_FILE
+from dataset.receipts import digest
 from labeling.errors import ConfigError
 from labeling.extraction import Effort
 from labeling.extractors import ExtractorChoice, choose_extractors
+from labeling.model_cards import ModelCard, find_weights
+from labeling.onnx_files import weights_sha256
+from labeling.timeline import FPS
 from pipelines.config import EFFORTS
 from pipelines.job import open_job
 from training.evaluation_estimates import EstimateSettings
@@ -52,12 +56,18 @@ class Ruler:
     object_variant: int
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values, the extractors with their hashes."""
+        """Plain values; of each extractor sha256 of its weights as they lie there, then a digest of its card."""
         return {
-            "version": _VERSION, "extractors": {card.name: card.sha256 for card in self.choice.cards},
+            "version": _VERSION,
+            "extractors": {card.name: _model_hash(card, self.models_dir) for card in self.choice.cards},
             "every": self.settings.every, "effort": self.settings.effort, "seconds": self.seconds,
             "ego": self.settings.ego.model_dump(mode="json"), "object_variant": self.object_variant,
         }  # fmt: skip
+
+
+def _model_hash(card: ModelCard, models_dir: Path | None) -> str:
+    path = find_weights(card, models_dir)
+    return f"{card.sha256 if path is None else weights_sha256(path)} {digest(card.model_dump(mode='json'))}"
 
 
 def read_ruler(job: Path, options: EvaluateOptions) -> Ruler:
@@ -89,7 +99,9 @@ def check_options(options: EvaluateOptions) -> None:
     """
     if options.effort is not None and options.effort not in EFFORTS:
         raise ConfigError(f"effort {options.effort!r} is not known; choose one of {', '.join(EFFORTS)}")
-    if options.seconds is not None and not options.seconds > 0:
-        raise ConfigError(f"--seconds {options.seconds:g} leaves nothing to compare; give a positive duration")
+    if options.seconds is not None and not options.seconds * FPS >= 1:
+        raise ConfigError(
+            f"--seconds {options.seconds:g} leaves nothing to compare; give a frame's duration, 1/{FPS} s, at least"
+        )
     if options.samples_per_clip < 1 or options.every < 1:
         raise ConfigError("--samples-per-clip and --every count from 1; give at least 1")

@@ -5,7 +5,7 @@ alone, so that a killed run goes on where it was.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,7 +121,8 @@ def generate_clips(
         How many clips were made, and how many were there.
 
     Raises:
-        ConfigError: options that a single clip only can have, or adapters that exclude each other.
+        ConfigError: options that a single clip only can have, adapters that exclude each other, or samples that are
+            longer than a clip whose own skeletons or objects they show.
         DataError: no such clip.
         ModelError: weights that are absent or do not fit.
     """
@@ -151,12 +152,12 @@ def _make(
     settings: SamplingSettings, adapters: Mapping[str, str],
 ) -> bool:  # fmt: skip
     """Make one clip's samples; False where they were there."""
-    caption = request.caption or sample.caption
+    caption = sample.caption if request.caption is None else request.caption
     about = {"adapters": dict(adapters)} | sample_facts(
         sample, ego=request.ego, true_skeletons=request.true_skeletons, object_variant=request.object_variant
     )
     record = sampling_record(generator, caption, samples=options.samples, seed=options.seed, settings=settings)
-    if _is_there(out, sample.key, {**record, **about}, options.samples, rgb=set(adapters) != {"motion"}):
+    if _is_there(out, sample.key, {**record, **about}, options.samples, stages=set(adapters)):
         return False
     own = clip_conditions(sample, with_ego=request.ego is None)
     prepared = prepare_conditions(
@@ -171,8 +172,18 @@ def _make(
 
 
 def _views(generator: ClipGenerator, sample: Sample, request: ClipsRequest) -> dict[str, Any]:
-    """The clip's own skeleton and object videos at the controls' size, where they are asked for."""
+    """The clip's own skeleton and object videos at the controls' size, where they are asked for.
+
+    Raises:
+        ConfigError: the samples are longer than the clip.
+    """
     views, count = {}, generator.frame_count
+    needed, there = (count - 1) * generator.picture(generator.first_stage).frame_step + 1, len(sample.cam_to_world)
+    if (request.true_skeletons or request.object_variant is not None) and needed > there:
+        raise ConfigError(
+            f"{sample.key} has {there} frames, but its own skeletons or objects are wanted in {needed}; give fewer "
+            "with --frames, or leave out --true-skeletons and --object-variant"
+        )
     if request.true_skeletons:
         views["skeleton_video"] = _skeletons(sample, generator.picture("appearance"), count)
     if request.object_variant is not None:
@@ -202,10 +213,12 @@ def _objects(sample: Sample, picture: PictureConfig, count: int, variant: int) -
     return np.stack(list(frames)[:: picture.frame_step])
 
 
-def _is_there(out: Path, key: str, record: dict[str, Any], samples: int, *, rgb: bool) -> bool:
-    """Whether the clip's record, written last, says that the same was made, and its videos are still there."""
-    file, folder = out / f"{key}.json", out if rgb else out / "skeleton"
-    if not file.is_file() or not all((folder / f"{key}_{number}.mp4").is_file() for number in range(samples)):
+def _is_there(out: Path, key: str, record: dict[str, Any], samples: int, *, stages: Set[str]) -> bool:
+    """Whether the clip's record says that the same was made, and its files are still there."""
+    folders = [out] * (stages != {"motion"}) + [out / "skeleton"] * ("end_to_end" not in stages)
+    videos = [folder / f"{key}_{number}.mp4" for folder in folders for number in range(samples)]
+    file = out / f"{key}.json"
+    if not all(path.is_file() for path in (file, out / "conditions" / f"{key}.tum", *videos)):
         return False
     try:
         return json.loads(file.read_text(encoding="utf-8")) == json.loads(json.dumps(record))

@@ -3,6 +3,7 @@
 Read from names and headers of files alone, since the modules that write them load torch.
 """
 
+import shlex
 from pathlib import Path
 
 from dataset.layout import LATENTS, SHARD_INDEX
@@ -23,12 +24,16 @@ def next_training(root: Path) -> tuple[str, str]:
     if not stores:
         others = ", ".join(name for name in BACKBONES if name != "ltx-2b")
         return (
-            f"animatic cache {root} --backbone ltx-2b",
-            f"{counted(len(keys), 'clip')} packed, which `animatic inspect {root}` shows; "
+            f"animatic cache {_quoted(root)} --backbone ltx-2b",
+            f"{counted(len(keys), 'clip')} packed, which `animatic inspect {_quoted(root)}` shows; "
             f"{'' if _weights_are_here('ltx-2b') else _NOT_HERE}other backbones: {others}",
         )
     # Of several backbones the one that has come furthest.
     return max((_next_of(root, store, keys) for store in stores), key=lambda step: step[0])[1:]
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
 
 
 def _weights_are_here(backbone: str) -> bool:
@@ -46,17 +51,22 @@ def _next_of(root: Path, store: Path, keys: set[str]) -> tuple[int, str, str]:
     cached = {path.stem for path in store.glob("clips/*/*.safetensors")}
     missing = len(keys - cached)
     if missing:
-        return 0, f"animatic cache {root} --backbone {store.name}", f"{missing} of {len(keys)} clips have no latents"
+        command = f"animatic cache {_quoted(root)} --backbone"
+        reason = f"{missing} of {len(keys)} clips have no latents"
+        if store.name in BACKBONES:
+            return 0, f"{command} {store.name}", reason
+        return 0, f"{command} BACKBONE.yaml", f"{reason} of {store.name}, whose file BACKBONE.yaml stands for"
     made: list[Path] = []
     for stage in _ADAPTERS:
         recipe = _recipe(stage, store.name)
         adapter = root / "adapters" / f"{recipe}_{stage}"
-        command = f"animatic train {stage} --data {root} --config {recipe}"
+        command = f"animatic train {stage} --data {_quoted(root)} --config {recipe}"
         if lacking := _lacking(adapter):
             return 1 + len(made), command, f"latents of {store.name} are cached; {lacking}"
         made.append(adapter)
     motion, appearance = made
-    command = f"animatic generate --data {root} --motion {motion} --appearance {appearance} --out {root / 'samples'}"
+    given = f"--motion {_quoted(motion)} --appearance {_quoted(appearance)} --out {_quoted(root / 'samples')}"
+    command = f"animatic generate --data {_quoted(root)} {given}"
     return 1 + len(made), command, "both adapters are there"
 
 

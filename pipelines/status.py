@@ -1,6 +1,7 @@
 """``animatic status`` and ``animatic inspect``: what is done, dropped and failed, and what to type next."""
 
 import json
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -112,7 +113,7 @@ def _is_through(stages: tuple[StageStatus, ...]) -> bool:
 def _next(job: Job, stages: tuple[StageStatus, ...], *, empty: bool) -> tuple[str, str]:
     """What to type next, and why."""
     root = job.root
-    again = f"animatic label --out {root}"
+    again = f"animatic label --out {shlex.quote(str(root))}"
     for stage in stages:
         if stage.retryable:
             count = sum(stage.retryable.values())
@@ -139,7 +140,7 @@ def print_status(root: Path, *, as_json: bool = False) -> int:
         print(json.dumps(asdict(status), indent=1))
         return int(failed)
     table = Table(
-        title=f"{root}: {counted(status.videos, 'video')}",
+        title=escape(f"{root}: {counted(status.videos, 'video')}"),
         title_justify="left",
         box=None,
         pad_edge=False,
@@ -246,7 +247,7 @@ def print_json(value: Any) -> None:
 
 def _print_summary(root: Path, summary: Summary) -> None:
     console = make_console()
-    table = Table(title=str(root), title_justify="left", show_header=False, box=None, pad_edge=False)
+    table = Table(title=escape(str(root)), title_justify="left", show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
     rule = f"at least {summary.threshold:.3g} objects" if summary.threshold is not None else "no threshold"
@@ -270,7 +271,8 @@ def _print_summary(root: Path, summary: Summary) -> None:
     print_black_skeletons(root, console)
     print_stale_shards(root, console)
     if sum(summary.packed.values()):
-        console.print(f"one clip: [bold]animatic inspect {root} {_some_key(root)} --sheet sheet.png[/]")
+        command = f"animatic inspect {shlex.quote(str(root))} {_some_key(root)} --sheet sheet.png"
+        console.print(f"one clip: [bold]{escape(command)}[/]")
     elif not summary.kept or (root / SHARD_INDEX).is_file():
         console.print(f"[red]{escape(why_nothing_is_left(root))}[/]")
 

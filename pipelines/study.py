@@ -17,7 +17,7 @@ import torch
 
 from dataset.pictures import write_picture
 from dataset.receipts import atomic_write, make_folder, storage_errors, try_folder
-from labeling.errors import ConfigError
+from labeling.errors import ConfigError, DataError
 from pipelines.charts import machine_name
 from pipelines.study_data import StudyClip, study_clips
 from training.clip_views import resized
@@ -83,10 +83,14 @@ class Study:
         return {clip.key: clip.cam_to_world[::PAIR_FRAMES] for clip in self.clips["val"]}
 
     def recorded(self, name: str, make: Callable[[], Any]) -> Any:
-        """What ``make`` returns, from the record where there is one."""
+        """What ``make`` returns, from the record where there is one.
+
+        Raises:
+            DataError: a record that is damaged.
+        """
         path = self.out / "records" / f"{name}.json"
         if path.is_file():
-            return json.loads(path.read_text(encoding="utf-8"))["value"]
+            return _read_record(path)["value"]
         started = time.process_time()
         value = make()
         spent = time.process_time() - started
@@ -108,6 +112,14 @@ class Study:
         return self.judge.read(video[:: JUDGED_EVERY // frame_step], pair_step=PAIR_FRAMES // JUDGED_EVERY)
 
 
+def _read_record(path: Path) -> dict[str, Any]:
+    try:
+        record = json.loads(path.read_bytes())
+        return {"value": record["value"], "processor_s": float(record["processor_s"])}
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: is no record of the study ({error}); remove it and run the study again") from error
+
+
 def run_study(
     out: Path, *, minutes: float | None = None, quick: bool = False, report: bool = False,
     say: Callable[[str], None] = print,
@@ -123,6 +135,7 @@ def run_study(
 
     Raises:
         ConfigError: the folder holds a study of another plan, or a budget too small; a report with nothing to report.
+        DataError: a record that is damaged.
         StorageError: the folder cannot be written to.
     """
     from pipelines.study_picture import draw_study
@@ -130,9 +143,13 @@ def run_study(
 
     plan = plan_study(quick=quick) if minutes is None else plan_study(minutes, quick=quick)
     study = Study(plan=plan, out=out, say=say)
+    _refuse_other_plan(study)
+    if report:
+        # What has nothing to report claims no folder.
+        _complete_seeds(study)
     try_folder(out)
     with storage_errors(out):
-        _claim(study)
+        atomic_write(_plan_file(study), _plan_text(study).encode())
         if not report:
             prepare(study)
             for seed in range(plan.scale.seeds):
@@ -165,12 +182,19 @@ def show_study(out: Path, *, minutes: float | None, quick: bool, report: bool) -
     return 0
 
 
-def _claim(study: Study) -> None:
+def _plan_file(study: Study) -> Path:
+    return study.out / "plan.json"
+
+
+def _plan_text(study: Study) -> str:
+    return json.dumps(asdict(study.plan), indent=1, sort_keys=True) + "\n"
+
+
+def _refuse_other_plan(study: Study) -> None:
     """Refuse a folder of another plan: its parts would be mixed."""
-    path, told = study.out / "plan.json", json.dumps(asdict(study.plan), indent=1, sort_keys=True) + "\n"
-    if path.is_file() and path.read_text(encoding="utf-8") != told:
+    path = _plan_file(study)
+    if path.is_file() and path.read_bytes() != _plan_text(study).encode():
         raise ConfigError(f"{study.out} holds a study of another plan; give another --out, or the budget it began with")
-    atomic_write(path, told.encode())
 
 
 def prepare(study: Study) -> None:
@@ -384,5 +408,5 @@ def _spent(study: Study) -> dict[str, float]:
     """Processor seconds by record, and in all."""
     spent: dict[str, float] = {}
     for path in sorted((study.out / "records").glob("*.json")):
-        spent[path.stem] = float(json.loads(path.read_text(encoding="utf-8"))["processor_s"])
+        spent[path.stem] = float(_read_record(path)["processor_s"])
     return spent | {"in all": round(sum(spent.values()), 1)}

@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -108,6 +109,24 @@ def test_a_backbone_that_needs_no_weights_is_named_where_those_of_the_first_are_
     weights.parent.mkdir(parents=True)
     weights.touch()
     assert "`--backbone tiny`" not in next_training(job)[1]
+
+
+def test_commands_to_type_next_can_be_typed_whatever_the_folder_is_called(run, job, tmp_path):
+    root = shutil.copytree(job, tmp_path / "my job [old]")
+    out = run("inspect", root)[1]
+    line = next(line for line in out.splitlines() if line.startswith("one clip: "))
+    assert shlex.split(line.removeprefix("one clip: "))[:3] == ["animatic", "inspect", str(root)]
+    assert f"{root}: 1 video\n" in run("status", root)[1]
+    assert shlex.split(next_training(root)[0])[2:3] == [str(root)]
+    for name in ("latents/mine/cache.json", "latents/mine/clips/street/street_0.safetensors"):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+    command, reason = next_training(root)
+    assert shlex.split(command) == ["animatic", "cache", str(root), "--backbone", "BACKBONE.yaml"]
+    assert reason == "1 of 2 clips have no latents of mine, whose file BACKBONE.yaml stands for"
+    shutil.rmtree(root / "shards")
+    again = json.loads(run("status", root, "--json")[1])["next_command"]
+    assert shlex.split(again) == ["animatic", "label", "--out", str(root)]
 
 
 def test_status_goes_on_to_training(run, job, tmp_path):

@@ -4,10 +4,12 @@ import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -19,18 +21,29 @@ from dataset.loader import Sample, ShardDataset
 from dataset.street import StreetConfig, write_street_video
 from labeling.camera import rebased_trajectory, write_tum
 from labeling.encoding import VideoWriter, lossless_rgb
-from labeling.errors import ConfigError, DataError, ModelError
+from labeling.errors import ConfigError, DataError, ModelError, VideoError
+from labeling.extractors import ExtractorChoice
+from labeling.model_cards import load_cards
 from labeling.object_video import chosen_tracks
 from pipelines.cli import app
 from pipelines.config import Config, merged
 from pipelines.evaluate import EvaluateOptions, Evaluation, evaluate
 from pipelines.evaluate_console import coverage_table, figure_table
 from pipelines.evaluate_notes import blind_ruler, clip_notes, record_notes, ruler_notes
+from pipelines.evaluate_ruler import Ruler
 from pipelines.generate_clips import ClipsRequest, chosen_clips, generate_clips
 from pipelines.job import Job
 from pipelines.sources import Source
-from training.evaluation_estimates import LEAST_CONFIDENCE, clip_truth, ego_fault
-from training.evaluation_files import SampleFolder, find_samples, sample_name, shown_frames, video_rate
+from training.evaluation_estimates import LEAST_CONFIDENCE, ClipEstimator, EstimateSettings, clip_truth, ego_fault
+from training.evaluation_files import (
+    SampleFiles,
+    SampleFolder,
+    find_samples,
+    read_sample,
+    sample_name,
+    shown_frames,
+    video_rate,
+)
 from training.evaluation_report import FLOOR, HELD, SAMPLES, TRUE_SKELETONS, VELOCITY
 
 WIDTH, HEIGHT, CLIP = 288, 192, 17
@@ -139,6 +152,13 @@ def test_what_fails_is_counted_with_its_reason(found: Evaluation) -> None:
     assert figures(found, SAMPLES)["min_ade_m"] < 0.15, "the best of those that were estimated"
 
 
+def test_a_picture_too_small_to_be_compared_is_a_fault(clip: Sample, tmp_path: Path) -> None:
+    path = write(tmp_path / "avenue_0_0.mp4", [cv2.resize(frame, (2, 2)) for frame in clip.frames("rgb.mp4")])
+    looker = ClipEstimator(clip, clip_truth(clip), extractors=None)
+    found = looker.estimate(SampleFiles(rgb=path))
+    assert found.readable and found.faults["picture"] == "pictures of 2x2 are too small to be compared"
+
+
 def test_each_sample_is_judged_at_its_own_rate_and_size(found: Evaluation) -> None:
     assert dict(found.report.sets[SAMPLES].geometries) == {
         "288x192 at 24 fps, 17 frames": 3, "192x128 at 12 fps, 9 frames": 1,
@@ -158,12 +178,14 @@ def test_a_second_run_looks_at_nothing_again_and_a_changed_sample_is_seen(
     monkeypatch.setattr(module, "_evaluate_clip", lambda task: looked.append(task.sample.key) or perfect.results[0])
     with (perfect.file.parent / "clips.jsonl").open("a") as stream:
         stream.write('{"stamp": "torn')
+    kept = perfect.file.parent / "clips.jsonl"
+    kept.write_bytes(b"\xff\xfe damaged\n" + kept.read_bytes())
     assert evaluate(job, folder, OPTIONS).report == perfect.report and not looked
     assert perfect.file.read_bytes() == before
     evaluate(job, folder, EvaluateOptions(every=4))
     assert looked == ["avenue_0"]
-    lines = (perfect.file.parent / "clips.jsonl").read_text().splitlines()
-    assert len(lines) == 3 and json.loads(lines[2])["result"]["key"] == "avenue_0", "a torn line swallows no other"
+    lines = kept.read_bytes().splitlines()
+    assert len(lines) == 4 and json.loads(lines[3])["result"]["key"] == "avenue_0", "a torn line swallows no other"
 
 
 @pytest.mark.parametrize("workers", [0, 1, 4])
@@ -260,6 +282,8 @@ def test_folders_without_samples_are_errors(job: Path, mixed: Path, tmp_path: Pa
     [
         ({"effort": "great"}, ConfigError, "effort 'great' is not known"),
         ({"seconds": 0.0}, ConfigError, "leaves nothing to compare"),
+        ({"seconds": 0.04}, ConfigError, "leaves nothing to compare; give a frame's duration, 1/24 s, at least"),
+        ({"seconds": float("nan")}, ConfigError, "leaves nothing to compare"),
         ({"every": 0}, ConfigError, "at least 1"),
         ({"extractors": ("nobody",)}, ConfigError, "no model card"),
         ({"extractors": ("rtmpose_m",)}, ModelError, "weights"),
@@ -299,6 +323,23 @@ def test_the_first_samples_count_in_the_order_of_their_numbers(tmp_path: Path) -
     assert video_rate(np.arange(11) / 10) == pytest.approx(10) and video_rate([0.0]) == 0
 
 
+@pytest.mark.parametrize("fps", [1, 2, 4])
+def test_slow_videos_are_whole_and_one_that_lacks_a_frame_is_not(tmp_path: Path, fps: int) -> None:
+    """Two keyframes a second are what many driving models give: no step of them is a hole."""
+    frames = np.random.default_rng(0).integers(0, 256, (9, 48, 64, 3), dtype=np.uint8)
+    path = write(tmp_path / "whole.mp4", frames, fps=fps)
+    video = read_sample(path)
+    assert len(video.frames) == 9 and video.times_s == pytest.approx(np.arange(9) / fps)
+    with av.open(path) as whole, av.open(tmp_path / "torn.mp4", "w") as torn:
+        stream = torn.add_stream_from_template(whole.streams.video[0])
+        for number, packet in enumerate(whole.demux(video=0)):
+            if packet.dts is not None and number != 4:
+                packet.stream = stream
+                torn.mux(packet)
+    with pytest.raises(VideoError, match="of 8 frames decode"):
+        read_sample(tmp_path / "torn.mp4")
+
+
 def test_objects_are_judged_by_the_tracks_that_the_samples_could_be_given(tmp_path: Path) -> None:
     """Eight walkers in the first 49 frames, eight more after them: the generator saw every other of 25 frames."""
     labels = [walker(frame, x=30, track_id=track) for track in range(1, 9) for frame in range(49)]
@@ -317,11 +358,27 @@ def test_objects_are_judged_by_the_tracks_that_the_samples_could_be_given(tmp_pa
     (tmp_path / "v_0.json").write_text('{"made by": "others"}')
     assert shown_frames(tmp_path / "v_0.json") is None and shown_frames(tmp_path / "none.json") is None
     assert max(clip_truth(sample).box_tracks) > 8, "without a record, the whole clip"
-    from labeling.extractors import ExtractorChoice
-
     assert record_notes(["v_0"], ["v_0"], ExtractorChoice()) == [], "no boxes are judged"
     choice: Any = SimpleNamespace(cards=["one"])
     assert "1 of 2 clips have no record" in record_notes(["v_0", "w_0"], ["v_0"], choice)[0]
+
+
+@pytest.mark.parametrize("change", ["card", "weights"])
+def test_what_was_found_with_another_card_or_other_weights_is_looked_at_again(tmp_path: Path, change: str) -> None:
+    shipped: Any = load_cards()["street_detector"]
+    card = shipped.model_copy(update={"name": "mine", "file": "mine.onnx", "sha256": None})
+    ruler = Ruler(
+        choice=ExtractorChoice(detector=card), models_dir=tmp_path, settings=EstimateSettings(), seconds=None,
+        object_variant=0,
+    )  # fmt: skip
+    (tmp_path / "mine.onnx").write_bytes(b"one export")
+    before = ruler.as_json()
+    assert before == ruler.as_json()
+    if change == "card":
+        ruler = replace(ruler, choice=ExtractorChoice(detector=card.model_copy(update={"score_threshold": 0.6})))
+    else:
+        (tmp_path / "mine.onnx").write_bytes(b"another export")
+    assert ruler.as_json() != before
 
 
 def motion(**changes: Any) -> Any:
@@ -365,8 +422,6 @@ def test_notes_say_what_was_left_out() -> None:
     notes = " | ".join(clip_notes({"a_0": "val", "b_0": "val", "t_0": "train"}, {SAMPLES: folder}, 6))
     for words in ("1 of 2 held-out", "1 clips are of the training split, such as t_0", "x.mp4", "3 samples beyond 6"):
         assert words in notes
-    from labeling.extractors import ExtractorChoice
-
     assert "neither boxes nor points" in ruler_notes(ExtractorChoice(), None)[0]
     assert "imported" in ruler_notes(ExtractorChoice(), Path("t"))[-1]
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from training_fixtures import walker
 
 from labeling.boxes import iou
 from labeling.camera import cover_map, rigid
@@ -322,3 +323,14 @@ def test_paired_intervals_need_pairs() -> None:
     assert (found.mean, found.low, found.high, found.groups) == (3, 2, 4, 2)
     with pytest.raises(DataError, match="no key has a value on both sides"):
         paired_interval({"a": 1.0}, {"b": 1.0}, {"a": "x", "b": "y"})
+
+
+def test_a_clip_of_one_frame_goes_on_as_it_is() -> None:
+    """``clip.clip_frames`` may be 1."""
+    truth = ClipTruth(
+        key="v_0", video_id="v", times_s=np.zeros(1), cam_to_world=np.eye(4)[None], labels=(walker(0, x=30),), width=96,
+        height=64,
+    )  # fmt: skip
+    found = constant_velocity(truth)
+    assert found.cam_to_world is not None and np.array_equal(found.cam_to_world, np.eye(4)[None])
+    assert found.labels is not None and np.array_equal(found.labels[0].box_xyxy, truth.labels[0].box_xyxy)

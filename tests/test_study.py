@@ -247,6 +247,25 @@ def test_the_road_over_a_hill_is_ground(hill_m):
     assert (shown == SEGMENTS.index("thing")).any()
 
 
+def test_a_report_of_nothing_leaves_nothing(tmp_path: Path) -> None:
+    """A plan left behind would refuse the study that is to be made there."""
+    from pipelines.study import run_study
+
+    with pytest.raises(ConfigError, match="has no seed whose arms are all judged"):
+        run_study(tmp_path / "study", report=True)
+    assert not (tmp_path / "study").exists()
+
+
+@pytest.mark.parametrize("damage", [b"{", b"\xff", b"[]", b'{"value": 1}'], ids=["torn", "bytes", "list", "half"])
+def test_a_damaged_record_is_named(tmp_path: Path, damage: bytes) -> None:
+    from pipelines.study import run_study
+
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "vae.json").write_bytes(damage)
+    with pytest.raises(DataError, match=r"vae\.json: is no record of the study .*; remove it and run the study again"):
+        run_study(tmp_path, quick=True, say=lambda line: None)
+
+
 def test_a_smoke_run_goes_through_and_goes_on_where_it_was(tmp_path: Path):
     from pipelines.study import run_study
 

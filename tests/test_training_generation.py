@@ -1,7 +1,8 @@
 """The two-stage generator: conditions, seeds, hand-over of latents, recipes for ego-motion, clear answers."""
 
 import json
-from dataclasses import asdict
+import shutil
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,16 @@ def adapters(tiny_job: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[S
 def generator(adapters: dict[Stage, Path]) -> ClipGenerator:
     backbone = load_backbone(backbone_config("tiny", picture=PICTURE))
     return ClipGenerator(backbone, motion=adapters["motion"], appearance=adapters["appearance"])
+
+
+def packed_clip() -> Any:
+    """A clip of nine frames, as a job's shards give it."""
+    meta = {
+        "picture": {"width": WIDTH, "height": HEIGHT}, "intrinsics": asdict(prior_intrinsics(WIDTH, HEIGHT)), "fps": 24
+    }  # fmt: skip
+    sample: Any = FakeSample(key="v_0", meta=meta)
+    sample.members, sample.iterate_frames = {}, lambda suffix: iter(sample.frames(suffix))
+    return sample
 
 
 def two_stages(adapters: dict[Stage, Path]) -> dict[str, Any]:
@@ -206,6 +217,11 @@ def test_trajectory_files_are_resampled_and_must_be_long_enough(tmp_path: Path) 
     assert found.cam_to_world[-1, 2, 3] == pytest.approx(10)
     with pytest.raises(ConfigError, match="lasts 2.90 s, the clip 5.00 s"):
         ego_trajectory(tmp_path / "drive.tum", frames=121, fps=24)
+    # By its rows, as `animatic ego --import` reads it, whatever its name.
+    shutil.copy(tmp_path / "drive.tum", tmp_path / "drive.txt")
+    assert np.array_equal(ego_trajectory(tmp_path / "drive.txt", frames=25, fps=24).cam_to_world, found.cam_to_world)
+    np.savetxt(tmp_path / "kitti.txt", poses[:, :3].reshape(-1, 12))
+    assert ego_trajectory(tmp_path / "kitti.txt", frames=9, fps=24).cam_to_world[-1, 2, 3] == pytest.approx(8)
     np.save(tmp_path / "drive.npy", poses)
     assert ego_trajectory(tmp_path / "drive.npy", frames=9, fps=24).cam_to_world[-1, 2, 3] == pytest.approx(8)
 
@@ -349,7 +365,9 @@ def test_a_killed_repeat_leaves_no_record_beside_other_videos(generator, tmp_pat
     monkeypatch.setattr(generator, "sample", killed)
     with pytest.raises(KeyboardInterrupt):
         write_samples(generator, conditions, out=tmp_path, name="v_0", samples=3, seed=1, settings=fast)
-    assert sorted(path.name for path in tmp_path.glob("v_0*")) == ["v_0_0.mp4", "v_0_1_0.mp4"]
+    assert sorted(path.name for path in tmp_path.glob("v_0*")) == ["v_0.json", "v_0_0.mp4", "v_0_1_0.mp4"]
+    told = json.loads((tmp_path / "v_0.json").read_text())
+    assert (told["unfinished"], told["seed"], told["samples"]) == (True, 1, 3)
     monkeypatch.undo()
     write_samples(generator, conditions, out=tmp_path, name="v_0", samples=3, seed=1, settings=fast)
     still = ClipConditions(image=IMAGE, caption="x", first_control=SKELETON)
@@ -359,12 +377,29 @@ def test_a_killed_repeat_leaves_no_record_beside_other_videos(generator, tmp_pat
     assert not list((tmp_path / "conditions").iterdir()), "this one was asked for no trajectory"
 
 
+def test_what_a_killed_first_run_made_is_not_taken_for_the_next_one_s(generator, tmp_path: Path, monkeypatch) -> None:
+    fast = SamplingSettings(steps=1, guidance=1.0)
+    still = ClipConditions(image=IMAGE, caption="x", first_control=SKELETON)
+    driven = replace(still, trajectory=ego_trajectory("straight 5m/s", frames=9, fps=24))
+    real = generator.sample
+
+    def killed(*given: Any, number: int, **named: Any) -> Any:
+        if number == 2:
+            raise KeyboardInterrupt
+        return real(*given, number=number, **named)
+
+    monkeypatch.setattr(generator, "sample", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_samples(generator, driven, out=tmp_path, name="v_0", samples=3, seed=5, settings=fast)
+    monkeypatch.undo()
+    write_samples(generator, still, out=tmp_path, name="v_0", samples=1, settings=fast)
+    found = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*"))
+    assert found == ["skeleton/v_0_0.mp4", "v_0.json", "v_0_0.mp4"]
+    assert "unfinished" not in json.loads((tmp_path / "v_0.json").read_text())
+
+
 def test_a_clip_is_made_again_when_the_trajectory_file_changes(generator, tmp_path: Path) -> None:
-    meta = {
-        "picture": {"width": WIDTH, "height": HEIGHT}, "intrinsics": asdict(prior_intrinsics(WIDTH, HEIGHT)), "fps": 24
-    }  # fmt: skip
-    sample: Any = FakeSample(key="v_0", meta=meta)
-    sample.members, sample.iterate_frames = {}, lambda suffix: iter(sample.frames(suffix))
+    sample = packed_clip()
     request = ClipsRequest(ego=str(tmp_path / "drive.tum"))
     options = GenerateOptions(steps=1, guidance=1.0)
 
@@ -376,6 +411,47 @@ def test_a_clip_is_made_again_when_the_trajectory_file_changes(generator, tmp_pa
         return _make(generator, sample, request, out=tmp_path / "o", options=options, settings=settings, adapters={})
 
     assert [made(speed) for speed in (0.1, 0.1, 2.0, 2.0)] == [True, False, True, False]
+
+
+@pytest.mark.parametrize(("given", "used"), [(None, packed_clip().caption), ("Night.", "Night."), ("", "")])
+def test_a_caption_for_all_clips_may_be_empty(generator, tmp_path: Path, given: str | None, used: str) -> None:
+    _make(
+        generator, packed_clip(), ClipsRequest(caption=given), out=tmp_path, adapters={},
+        settings=SamplingSettings(steps=1), options=GenerateOptions(steps=1),
+    )  # fmt: skip
+    assert json.loads((tmp_path / "v_0.json").read_text())["caption"] == used
+
+
+@pytest.mark.parametrize("gone", ["v_0_1.mp4", "skeleton/v_0_1.mp4", "conditions/v_0.tum", "v_0.json"])
+def test_a_clip_is_made_again_when_one_of_its_files_is_gone(generator, tmp_path: Path, gone: str) -> None:
+    def made() -> bool:
+        return _make(
+            generator, packed_clip(), ClipsRequest(), out=tmp_path, adapters={}, settings=SamplingSettings(steps=1),
+            options=GenerateOptions(samples=2, steps=1),
+        )  # fmt: skip
+
+    assert (made(), made()) == (True, False)
+    (tmp_path / gone).unlink()
+    assert made() and (tmp_path / gone).is_file() and not made()
+
+
+@pytest.mark.parametrize("asked", [ClipsRequest(ego="still", true_skeletons=True), ClipsRequest(object_variant=0)])
+def test_a_clip_s_own_views_are_not_wanted_beyond_its_end(generator, tmp_path: Path, asked: ClipsRequest) -> None:
+    """What lies beyond it would be drawn black, as if nothing were there."""
+    longer = ClipGenerator(
+        load_backbone(generator.backbone.config), motion=generator.motion, appearance=generator.appearance, frames=17
+    )
+    with pytest.raises(ConfigError, match="v_0 has 9 frames, but its own skeletons or objects are wanted in 17"):
+        _make(
+            longer, packed_clip(), asked, out=tmp_path, adapters={}, settings=SamplingSettings(steps=1),
+            options=GenerateOptions(steps=1),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("frames", [0, -7])
+def test_no_frames_are_not_taken_for_the_usual_ones(generator, frames: int) -> None:
+    with pytest.raises(ConfigError, match=f"--frames {frames} leaves nothing"):
+        ClipGenerator(generator.backbone, motion=generator.motion, frames=frames)
 
 
 def test_the_record_of_one_clip_tells_what_it_was_made_of(adapters, tmp_path: Path) -> None:

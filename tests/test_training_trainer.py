@@ -17,7 +17,7 @@ from training.adapters import activate_adapter
 from training.backbones import load_backbone
 from training.batches import Draw, StepBatches, TrainingItems, collate
 from training.checkpoints import list_checkpoints, newest_checkpoint, save_checkpoint
-from training.config import TrainConfig
+from training.config import Stage, TrainConfig
 from training.guards import TrainingError, memory_advice, memory_knobs
 from training.latents import open_store
 from training.run_log import RunLog, read_metrics
@@ -533,6 +533,19 @@ def test_gradients_are_clipped_to_the_limit_and_told_as_they_were(
     assert used == pytest.approx([limit] * 2 if limit else told, rel=1e-2 if limit else 1e-5)
 
 
+@pytest.mark.parametrize("stage", ["motion", "appearance"])
+def test_a_control_video_that_was_not_cached_is_told_before_a_folder_is_made(
+    stage: Stage, tiny_job: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
+    config = tiny_config(stage, conditions={"control": "hdmap"})
+    with pytest.raises(DataError, match="holds skeleton videos, but none called hdmap; .* --controls hdmap --refresh"):
+        train(config, data=tiny_job, out=tmp_path / "out", quiet=True)
+    assert not (tmp_path / "out").exists()
+    # The baseline sees no control video.
+    baseline = tiny_config("end_to_end", conditions={"control": "hdmap"}, optimiser={"steps": 1})
+    train(baseline, data=tiny_job, out=tmp_path / "out", quiet=True)
+
+
 def test_fetching_ahead_keeps_order_and_errors() -> None:
     from torch.utils.data import DataLoader
 
@@ -549,9 +562,13 @@ def test_fetching_ahead_keeps_order_and_errors() -> None:
         def __len__(self) -> int:
             return 7
 
-    def loader(start_step: int = 0) -> DataLoader:
+    def loader(start_step: int = 0, *, workers: int = 0) -> DataLoader:
         batches = StepBatches(7, config=config, start_step=start_step)
-        return DataLoader(Numbers(), batch_sampler=batches, collate_fn=lambda items: items[0])
+        return DataLoader(Numbers(), batch_sampler=batches, collate_fn=lambda items: items[0], num_workers=workers)
+
+    # Without the traceback that torch puts around what a worker raises.
+    with Prefetched(loader(5, workers=1)) as torn, pytest.raises(DataError, match="^clip 5 is damaged$"):
+        next(torn)
 
     with Prefetched(loader()) as ahead:
         seen = [next(ahead) for _ in range(4)]

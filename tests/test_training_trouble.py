@@ -20,7 +20,7 @@ from training.checkpoints import list_checkpoints, newest_checkpoint, save_check
 from training.config import TrainConfig
 from training.latent_store import LatentStore
 from training.run_log import METRICS, read_metrics
-from training.run_state import FILES, read_state
+from training.run_state import ADAPTER, FILES, read_state
 from training.trainer import TrainSummary, train
 
 
@@ -278,6 +278,22 @@ def test_a_kill_while_a_step_is_saved_again_leaves_one_whole(tmp_path: Path, mon
     save_checkpoint(tmp_path, 1, {"a": b"third"}, keep=1)
     assert [path.name for path in tmp_path.iterdir()] == ["step_00000001"]
     assert (tmp_path / "step_00000001" / "a").read_bytes() == b"third"
+
+
+@pytest.mark.parametrize("left", ["an earlier one", "none"])
+def test_a_kill_between_the_last_checkpoint_and_the_adapter_leaves_the_last_adapter(
+    left: str, tiny_job: Path, finished: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
+    """There is no step left to do, so nothing else would put it there."""
+    out = shutil.copytree(finished, tmp_path / "run")
+    whole = (out / ADAPTER).read_bytes()
+    (out / ADAPTER).unlink()
+    if left != "none":
+        shutil.copy(out / "checkpoints" / "step_00000001" / ADAPTER, out / ADAPTER)
+    assert resumed(tiny_job, out) == 2
+    assert (out / ADAPTER).read_bytes() == whole
+    progress = read_progress(out)
+    assert progress is not None and progress.finished
 
 
 def test_what_a_kill_left_beside_the_adapter_is_swept(tiny_job: Path, finished: Path, tmp_path: Path) -> None:  # noqa: F811

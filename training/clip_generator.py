@@ -64,7 +64,8 @@ class ClipGenerator:
         frames: video frames; what the adapters were trained on if None.
 
     Raises:
-        ConfigError: no adapter, ones that exclude each other, or one of another stage, control video or frame rate.
+        ConfigError: no adapter, ones that exclude each other, or one of another stage, control video or frame rate; no
+            frame.
         ModelError: adapters that do not fit the backbone.
     """
 
@@ -82,6 +83,8 @@ class ClipGenerator:
         chosen: dict[Stage, Path] = {stage: Path(path) for stage, path in given.items() if path is not None}
         if not chosen or ("end_to_end" in chosen and len(chosen) > 1):
             raise ConfigError("give --motion and --appearance (either alone works too), or --end-to-end alone")
+        if self.frames is not None and self.frames < 1:
+            raise ConfigError(f"--frames {self.frames} leaves nothing to generate; give at least 1")
         for stage, path in chosen.items():
             _check_stage(path, stage)
         for stage, path in chosen.items():

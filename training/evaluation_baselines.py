@@ -50,7 +50,7 @@ def _moved_on(truth: ClipTruth, past: int) -> list[Keypoints]:
         middle = (box_step[:2] + box_step[2:]) / 2
         for frame in range(len(truth.times_s)):
             points = label.points.copy()
-            points[:, :2] += np.where(both, point_step, middle) * (frame / past)
-            box = label.box_xyxy + box_step * np.float32(frame / past)
+            points[:, :2] += np.where(both, point_step, middle) * (frame / max(past, 1))
+            box = label.box_xyxy + box_step * np.float32(frame / max(past, 1))
             labels.append(replace(label, frame=frame, box_xyxy=box.astype(np.float32), points=points))
     return labels

@@ -201,7 +201,10 @@ class ClipEstimator:
         for frame in self._looks(len(video.frames))[1:] or [len(video.frames) - 1]:
             if video.times_s[frame] <= self.truth.times_s[-1] + 1e-6:
                 true = covered(self.pictures[nearest[frame]], width=found.width, height=found.height)
-                psnr[frame], ssim[frame] = picture_similarity(video.frames[frame][None], true[None])
+                try:
+                    psnr[frame], ssim[frame] = picture_similarity(video.frames[frame][None], true[None])
+                except AnimaticError as error:
+                    return with_fault(found, "picture", _reason(error))
         return replace(found, psnr_db=psnr, ssim=ssim)
 
     def _with_skeletons(self, found: SampleEstimate, path: Path) -> SampleEstimate:

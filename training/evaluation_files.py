@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from labeling.errors import AnimaticError, DataError, VideoError
-from labeling.video import decode_frames, probe, read_packet_times
+from labeling.packet_times import HOLE_S, read_packet_times
+from labeling.video import decode_frames, probe
 
 SKELETONS = "skeleton"
 """Folder of the skeleton videos beside a folder of samples, as ``animatic generate`` writes them."""
@@ -140,7 +141,10 @@ def read_sample(path: Path) -> SampleVideo:
         VideoError: it cannot be opened, is cut off, holds frames that do not decode, or a single frame.
     """
     packets = read_packet_times(path)
-    decoded = [(frame.time_s, frame.rgb) for frame in decode_frames(path) if frame.is_clean]
+    # Below 4 fps every step is as long as a hole in a recording; one that lacks a frame is longer than the others.
+    steps_s = np.diff(packets.times_s)
+    hole_s = max(HOLE_S, 1.5 * float(np.median(steps_s))) if len(steps_s) else HOLE_S
+    decoded = [(frame.time_s, frame.rgb) for frame in decode_frames(path, hole_s=hole_s) if frame.is_clean]
     count = len(packets.times_s) + packets.broken_packets
     if len(decoded) < count:
         raise VideoError(f"{path.name}: {len(decoded)} of {count} frames decode; write it again")

@@ -159,10 +159,11 @@ def write_samples(
     generator: ClipGenerator, conditions: ClipConditions, *, out: Path, name: str, samples: int = 1, seed: int = 0,
     settings: SamplingSettings | None = None, about: Mapping[str, Any] | None = None,
 ) -> list[GeneratedFiles]:  # fmt: skip
-    """Sample and write: ``conditions/<name>.tum``, ``<name>_<n>.mp4``, ``skeleton/<name>_<n>.mp4``, and last a record.
+    """Sample and write: ``conditions/<name>.tum``, ``<name>_<n>.mp4``, ``skeleton/<name>_<n>.mp4``, and a record.
 
-    What an earlier record of that name says was written is taken away first, so that no video is ever found beside a
-    record of other settings, however a run ends.
+    What an earlier record of that name says was written is taken away first. The record is there from the start, called
+    ``unfinished`` until the last sample is: so no video is ever found beside a record of other settings, however a run
+    ends.
 
     Args:
         generator: with its adapters.
@@ -179,9 +180,12 @@ def write_samples(
         StorageError: no space left, or ``out`` cannot be written to.
     """
     settings, rate = settings or SamplingSettings(), generator.picture(generator.first_stage).rate
+    record = sampling_record(generator, conditions.caption, samples=samples, seed=seed, settings=settings)
+    record |= about or {}
     make_folder(out)
     with storage_errors(out):
         _take_away(out, name)
+        _write_record(out, name, {**record, "unfinished": True})
         if conditions.trajectory is not None:
             (out / "conditions").mkdir(parents=True, exist_ok=True)
             write_tum(conditions.trajectory, out / "conditions" / f"{name}.tum")
@@ -189,10 +193,12 @@ def write_samples(
     for number in range(samples):
         clip = generator.sample(conditions, seed=seed, number=number, settings=settings)
         written.append(write_clip(clip, out, f"{name}_{number}", fps=rate, seed=seed, number=number))
-    record = sampling_record(generator, conditions.caption, samples=samples, seed=seed, settings=settings)
-    text = json.dumps({**record, **(about or {})}, sort_keys=True, indent=1)
-    atomic_write(out / f"{name}.json", f"{text}\n".encode())
+    _write_record(out, name, record)
     return written
+
+
+def _write_record(out: Path, name: str, record: Mapping[str, Any]) -> None:
+    atomic_write(out / f"{name}.json", f"{json.dumps(record, sort_keys=True, indent=1)}\n".encode())
 
 
 def _take_away(out: Path, name: str) -> None:

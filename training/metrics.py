@@ -211,17 +211,19 @@ def picture_similarity(generated: np.ndarray, truth: np.ndarray) -> tuple[float,
     """PSNR (dB) and SSIM of two videos, (T, H, W, 3) uint8, means over frames (scikit-image).
 
     Raises:
-        DataError: the shapes differ.
+        DataError: the shapes differ, or a side is less than three pixels, which SSIM's smallest window has.
     """
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
     if generated.shape != truth.shape:
         raise DataError(f"pictures of {generated.shape} and {truth.shape} cannot be compared; resize one first")
+    side = min(7, *truth.shape[1:3])
+    if side < 3:
+        raise DataError(f"pictures of {truth.shape[2]}x{truth.shape[1]} are too small to be compared")
     psnr = [
         peak_signal_noise_ratio(b, a, data_range=255) if (a != b).any() else 99.0
         for a, b in zip(generated, truth, strict=True)
     ]
-    side = min(7, *truth.shape[1:3])
     ssim = [
         structural_similarity(a, b, channel_axis=2, data_range=255, win_size=side - (side + 1) % 2)
         for a, b in zip(generated, truth, strict=True)

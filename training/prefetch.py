@@ -10,6 +10,8 @@ from typing import Any
 
 from torch.utils.data import DataLoader
 
+from labeling.errors import AnimaticError
+
 _LOOK_S = 0.1
 """How often a waiting thread looks whether the other one still lives."""
 _LEAVE_S = 10.0
@@ -55,7 +57,7 @@ class Prefetched:
             self._ready.put(("end", None))
         except BaseException as error:
             # It belongs to whoever waits for the batch.
-            self._ready.put(("error", error))
+            self._ready.put(("error", _in_its_own_words(error)))
 
     def __iter__(self) -> Iterator[Any]:
         return self
@@ -77,6 +79,13 @@ class Prefetched:
             except queue.Empty:
                 if not running:
                     return "end", None
+
+
+def _in_its_own_words(error: BaseException) -> BaseException:
+    """What a person can mend without the traceback that torch puts around it when a worker raises it."""
+    kind = type(error)
+    *around, words = str(error).split(f"{kind.__module__}.{kind.__qualname__}: ")
+    return kind(words.strip()) if around and isinstance(error, AnimaticError) else error
 
 
 def leave_signals_to_the_trainer(_worker: int = 0) -> None:

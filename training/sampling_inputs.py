@@ -10,6 +10,7 @@ import numpy as np
 
 from dataset.tables import read_keypoints
 from labeling.camera import Intrinsics, Trajectory, cover_map, read_kitti, read_tum, rebased_trajectory, resample
+from labeling.ego_import import trajectory_format
 from labeling.ego_video import ego_frames
 from labeling.errors import ConfigError, DataError
 from labeling.labels import Keypoints
@@ -163,7 +164,8 @@ def ego_trajectory(source: str | Path | Trajectory, *, frames: int, fps: float) 
         poses = _poses(Path(source))
         given = rebased_trajectory(np.arange(len(poses)) / fps, poses)
     elif Path(source).is_file():
-        given = read_tum(Path(source)) if Path(source).suffix == ".tum" else read_kitti(Path(source), fps=fps)
+        tum = trajectory_format(Path(source)) == "tum"
+        given = read_tum(Path(source)) if tum else read_kitti(Path(source), fps=fps)
     else:
         return recipe_trajectory(str(source), frames=frames, fps=fps)
     wanted = given.timestamps_s[0] + np.arange(frames) / fps

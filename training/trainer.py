@@ -36,6 +36,7 @@ from training.prefetch import Prefetched, leave_signals_to_the_trainer
 from training.run_log import METRICS, RunLog
 from training.run_state import ADAPTER, FILES, RunState, config_differences, pack_state, read_state, restore
 from training.schedule import learning_rate
+from training.stages import reference_names, target_name
 from training.validation import held_out_losses, write_validation_videos
 
 Resume = Literal["auto", "never"] | Path
@@ -166,7 +167,15 @@ class Trainer:
                 "--out to train on these"
             )
         restore(checkpoint, self.backbone.denoiser, self.optimiser, self.names, adapter=self.config.stage)
+        if self.accelerator.is_main_process:
+            self._put_adapter((checkpoint / ADAPTER).read_bytes())
         return state.step
+
+    def _put_adapter(self, adapter: bytes) -> None:
+        """The adapter beside the checkpoints: a kill, or a full disk, between the two leaves an earlier one or none."""
+        path = self.out / ADAPTER
+        if not path.is_file() or path.read_bytes() != adapter:
+            atomic_write(path, adapter)
 
     def _loader(self, start_step: int) -> DataLoader:
         # The order is a function of the step alone: how far a loader got differs from process to process.
@@ -292,7 +301,7 @@ class Trainer:
         save_checkpoint(self.out / "checkpoints", self.step, files, keep=self.config.checkpoint.keep)
         adapter = files[ADAPTER]
         assert isinstance(adapter, bytes)
-        atomic_write(self.out / ADAPTER, adapter)
+        self._put_adapter(adapter)
 
     def _validate(self, log: RunLog) -> dict[str, float]:
         values = held_out_losses(self.backbone, self.items, self.store, self.config, accelerator=self.accelerator)
@@ -344,6 +353,15 @@ def _fitting_store(config: TrainConfig, data: Path) -> LatentStore:
     check_store(store, config.backbone)
     if not store.keys("train"):
         raise DataError(f"{store.folder} has no clips for training; run `animatic cache` first")
+    control = config.conditions.control
+    held = ["skeleton", *filter(None, store.manifest.parts.get("controls", "").split(","))]
+    needed = (target_name(config.stage, control=control), *reference_names(config.stage, control=control))
+    if control in needed and control not in held:
+        raise DataError(
+            f"{store.folder} holds {' and '.join(held)} videos, but none called {control}; cache again with "
+            f"`animatic cache --controls {','.join([*held[1:], control])} --refresh`, or set conditions.control to one "
+            "that is there"
+        )
     picture = manifest_picture(store)
     if config.backbone.picture.frames not in (None, picture.frames):
         raise ConfigError(f"latents have {picture.frames} frames, the config asks for {config.backbone.picture.frames}")
