@@ -64,7 +64,8 @@ class TruthFigures:
     car_recall: float
     """Of cars at least 32 px high and 30 % visible, found with an overlap of 0.3 by a label that no other car has."""
     car_precision: float
-    """Of labelled cars, those that are a true one, however small, found so."""
+    """Of labelled cars, those that are a true one, found so; what is none, but lower than 32 px or on a car that is not
+    looked for, is left out."""
     cars: int
     """True cars that were looked for."""
     point_error_px: float
@@ -265,7 +266,8 @@ def _truth_section(truth: TruthFigures) -> Section:
         (
             "labels that are cars",
             f"{truth.car_precision:.1%}",
-            "of true cars of any size; IoU 0.3",
+            "a true car, IoU 0.3; what is none counts as wrong if 32 px high and not on a car too low or hidden to be "
+            "looked for",
         ),
         ("car points", f"{truth.point_error_px:.2f} px", "median distance, visible points of found cars"),
         (
