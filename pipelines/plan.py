@@ -25,7 +25,7 @@ from pipelines.engine import Engine
 from pipelines.job import Job
 from pipelines.label import ALL_STAGES, Reporter, StageReport, run_stages
 from pipelines.models import check_models_folder
-from pipelines.sources import Source, find_videos, with_leave_out
+from pipelines.sources import Source, find_videos, likely_twins, with_leave_out
 from pipelines.stage import Part
 from pipelines.stages_source import packet_facts
 from pipelines.trial_windows import SourceClips, plan_windows, read_clips
@@ -51,13 +51,16 @@ class JobPlan:
     """Videos that cannot be opened, with the reason."""
     damaged: tuple[str, ...]
     """Videos that are less than they claim, as far as is known: files cut off, and those that were measured on."""
+    twins: dict[str, str]
+    """By video id, the video that has the same bytes and is counted in its place."""
     too_short: int
     """Videos that are shorter than a clip, less what is left out of them."""
     clip_frames: int
     """Of one clip."""
     source_hours: float
     clips: int
-    """Candidates: all that fit on the videos' timelines; of the videos that were measured on, those without a hole."""
+    """Candidates: all that fit on the videos' timelines, twins' left out; of the videos that were measured on, those
+    without a hole."""
     kept_clips: int
     """Kept by their objects."""
     sampled_clips: int
@@ -109,33 +112,37 @@ def plan_job(
         sources = list(with_leave_out(by_id, options.leave_out).values())
     lengths, cut_off, broken = _lengths_s(sources)
     candidates = {name: count_candidates(length, config.clip) for name, length in lengths.items()}
-    usable = [source for source in sources if candidates.get(source.video_id)]
+    long_enough = [source for source in sources if candidates.get(source.video_id)]
+    twins = likely_twins([source for source in sources if source.video_id in lengths])
+    usable = [source for source in long_enough if source.video_id not in twins]
     if not usable:
         raise ConfigError(
             f"none of {len(sources)} videos is long enough for one clip of {config.clip.clip_frames} frames "
             f"({_clip_s(config.clip):g} s); give longer videos, or a smaller clip.clip_frames with --config"
         )
-    too_short = len(lengths) - len(usable)
     clips_of = functools.cache(functools.partial(read_clips, clip=config.clip))
     receipts = _calibrate(usable, clips_of, config, options.models, seconds=calibration_s)
     measured = _Measured.of(receipts)
     candidates |= {
         source.video_id: len(clips_of(source).clips) for source in usable if source.video_id in receipts["index"]
     }
-    total = sum(candidates.values())
+    judged = {name: count for name, count in candidates.items() if name not in twins}
+    total = sum(judged.values())
     kept = max(1, round(total * measured.kept_clips / measured.clips))
     sampled = min(kept, config.select.sample_clips or kept)
     looked = {name: receipt.facts for name, receipt in receipts["index"].items()}
     damaged = damage_lines(cut_off | looked, receipts["cut"].values())
     return JobPlan(
-        videos=len(lengths), broken=broken, damaged=tuple(damaged),
-        too_short=too_short, clip_frames=config.clip.clip_frames,
+        videos=len(lengths), broken=broken, damaged=tuple(damaged), twins=twins,
+        too_short=len(lengths) - len(long_enough), clip_frames=config.clip.clip_frames,
         source_hours=sum(lengths.values()) / 3600,
         clips=total, kept_clips=kept, sampled_clips=sampled, clip_hours=sampled * _clip_s(config.clip) / 3600,
-        stages=_scaled(receipts, measured, lengths, candidates=candidates, sampled=sampled),
+        stages=_scaled(
+            receipts, measured, lengths, candidates=judged, counted=sum(candidates.values()), sampled=sampled
+        ),
         calibration_s=measured.window_s, calibration_clips=measured.kept_clips,
         calibration_videos=measured.videos, workers=workers, parts=parts,
-        largest_part=_largest_part(lengths, parts),
+        largest_part=_largest_part({name: length for name, length in lengths.items() if name not in twins}, parts),
     )  # fmt: skip
 
 
@@ -266,15 +273,16 @@ def _scaled(
     lengths_s: dict[str, float],
     *,
     candidates: dict[str, int],
+    counted: int,
     sampled: int,
 ) -> tuple[StageCost, ...]:
-    """Costs of the whole job: reading grows with the footage, counting with its clips, the rest with what is taken; of
-    a video's camera only so much is looked at."""
+    """Costs of the whole job: reading grows with the footage, counting with its clips (``counted``, twins' as well),
+    the rest with what is taken; of a video's camera only so much is looked at."""
     clips = sum(candidates.values())
     taken = {name: count * sampled / clips * measured.frames_per_clip for name, count in candidates.items()}
     looked = sum(min(frames, ROAD_FRAMES) for frames in taken.values())
     by_length = sum(lengths_s.values()) / max(measured.video_s, 1e-9)
-    factors = {"source": by_length, "index": by_length, "count": clips / measured.clips, "select": 1.0}
+    factors = {"source": by_length, "index": by_length, "count": counted / measured.clips, "select": 1.0}
     factors["camera"] = looked / max(measured.camera_frames, 1)
     costs = []
     for stage, made in receipts.items():
