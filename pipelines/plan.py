@@ -31,6 +31,8 @@ from pipelines.stages_source import packet_facts
 from pipelines.trial_windows import SourceClips, plan_windows, read_clips
 
 CALIBRATION_S = 60.0
+_WARM_UP_FRAMES = 25
+"""Of a clip: enough for every stage to have something to do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,7 +202,7 @@ def _calibrate(
     *,
     seconds: float,
 ) -> dict[str, dict[str, Receipt]]:
-    """Receipts of a small job on windows of videos; one on a single clip before it pays for loading and compiling.
+    """Receipts of a small job on windows of videos; one on a second before it pays for loading and compiling.
 
     Raises:
         ConfigError: no video holds a whole clip.
@@ -212,10 +214,13 @@ def _calibrate(
             f"none of {len(sources)} videos holds a clip of {_clip_s(clip):g} s without a hole, so none would be kept; "
             "give recordings without gaps, or a smaller clip.clip_frames with --config"
         )
-    (warm_up,) = plan_windows(sources, clips_of, clip_frames=clip.clip_frames, seconds=0)
+    short = clip.model_copy(update={"clip_frames": min(clip.clip_frames, _WARM_UP_FRAMES)})
+    (warm_up,) = plan_windows(
+        sources, lambda source: clips_of(source).cut_to(short.clip_frames), clip_frames=short.clip_frames, seconds=0
+    )
     unsampled = config.model_copy(update={"select": config.select.model_copy(update={"sample_clips": None})})
     with tempfile.TemporaryDirectory(prefix="animatic-plan-") as scratch:
-        _run(Path(scratch) / "warm-up", [warm_up], unsampled, models_dir)
+        _run(Path(scratch) / "warm-up", [warm_up], unsampled.model_copy(update={"clip": short}), models_dir)
         return _run(Path(scratch) / "job", windows, unsampled, models_dir)
 
 

@@ -130,6 +130,16 @@ def test_no_window_falls_between_the_clips(length_s: float, seconds: float) -> N
     assert kept and (len(kept) == 1 or kept[-1].end - kept[0].start <= 24 * seconds)
 
 
+@pytest.mark.parametrize(("frames", "left"), [(25, 25), (121, 121), (500, 121)])
+def test_the_warm_up_is_the_beginning_of_a_clip(frames: int, left: int) -> None:
+    source = Source(video_id="v", path=Path("v.mp4"))
+    found = clips_of(61.7, source)
+    (window,) = plan_windows([source], lambda _: found.cut_to(frames), clip_frames=left, seconds=0)
+    timeline = plan_timeline(np.arange(found.frames) / 24)
+    (kept,) = plan_clips(timeline, clip_frames=left, leave_out_s=window.leave_out_s).kept
+    assert len(kept) == left and kept.start in {clip.start for clip in found.clips}
+
+
 def test_videos_whose_middle_is_a_hole_are_measured_beside_it(
     tmp_path: Path, options: JobOptions, capsys: pytest.CaptureFixture[str]
 ) -> None:
