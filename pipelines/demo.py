@@ -209,6 +209,7 @@ def train_and_generate(job: Path, out: Path, sample: Sample) -> tuple[dict[str, 
     import torch
 
     from pipelines.train import GenerateOptions, run_cache, run_generate, run_train
+    from training.adapter_notes import adapter_file
 
     # One thread: the tiny network gains nothing from more, and loses much where cores are shared.
     torch.set_num_threads(1)
@@ -221,7 +222,7 @@ def train_and_generate(job: Path, out: Path, sample: Sample) -> tuple[dict[str, 
             stage, data=job, config="tiny", out=folder, overrides={"optimiser": {"steps": TRAIN_STEPS}},
             on_step=lambda step, loss: None,
         )  # fmt: skip
-        adapters[stage] = getattr(summary, "adapter", folder / "adapter.safetensors")
+        adapters[stage] = getattr(summary, "adapter", adapter_file(folder))
         losses[stage] = _logged_losses(folder / "metrics.jsonl")
     files = run_generate(
         out=out / "generated", motion=adapters["motion"], appearance=adapters["appearance"], data=job,

@@ -1,12 +1,15 @@
 """The command line's own errors: one line on standard error that names the option, and exit code 2."""
 
 import sys
+from typing import get_args, get_type_hints
 
 import pytest
 import typer
 
 from pipelines.cli import app, main
 from pipelines.cli_errors import USAGE_ERRORS, parser_error
+from pipelines.cli_training import generate
+from training.config import Convention
 
 
 def words_of(value):
@@ -106,3 +109,9 @@ def test_the_parsers_errors_are_those_of_this_typer():
 def test_a_typer_that_keeps_no_such_error_is_said(known):
     with pytest.raises(ImportError, match=f"this typer's {known.__name__} is no ClickException .* constraints.txt"):
         parser_error(known)
+
+
+def test_choices_of_generate_are_those_of_the_sampler():
+    """The command line spells them out, since it loads no settings before a command is called."""
+    coordinates = get_type_hints(generate)["coordinates"]
+    assert get_args(coordinates) == get_args(Convention)
