@@ -5,6 +5,9 @@ For a pixel with ray ``d = ((x-cx)/fx, (y-cy)/fy, 1)`` and a plane ``n.X = c`` t
 in the pixel, and a texture coordinate is ``(g.d) / inverse_depth + g0`` (perspective-correct). Edges blend by the
 distance of the pixel's centre to the edge. Textures are read trilinearly from a mip chain (Williams 1983) with several
 taps along the longer axis of the pixel's footprint (Heckbert 1989).
+
+All in one module, since the cache of a compiled function sees changes in its own file alone. Helpers of the loop over
+polygons take few arrays: one more call for each polygon with all of them makes painting 5 % slower.
 """
 
 import numba
@@ -48,10 +51,11 @@ def paint(
     count = len(polygons)
     plan = np.empty((count, 3)), np.zeros((count, 2, 3)), np.empty((count, 2))
     waiting = np.full(canvas.owner.shape, -1, np.int32)
+    shapes = polygons.corners, polygons.corner_count, polygons.soft, polygons.gradient, polygons.texture
     _scan(
-        canvas.rgb, canvas.inverse_depth, canvas.owner, drawn, rejected, first, last, polygons.corners,
-        polygons.corner_count, polygons.gradient, shading, polygons.owner, polygons.alpha, polygons.grow_px,
-        polygons.soft, world_to_cam.astype(np.float64), np.array(camera, np.float64), waiting, plan,
+        (canvas.rgb, canvas.inverse_depth, canvas.owner, waiting), (drawn, rejected), (first, last), shapes,
+        (polygons.owner, polygons.alpha, polygons.grow_px),
+        (world_to_cam.astype(np.float64), np.array(camera, np.float64)), plan, shading,
     )  # fmt: skip
     _shade_waiting(canvas.rgb, waiting, first, last, plan, shading)
     return drawn, rejected
@@ -204,38 +208,81 @@ def _row_bounds(edges, used, y, width, extent, grow):
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _scan(
-    rgb, inverse_depth, owners, drawn, rejected, first_row, last_row, corners, corner_count, gradient, shading,
-    owner, alpha, grow, soft, rotation, camera, waiting, plan,
-):  # fmt: skip
+def _inverse_depth_span(cam, left, span):
+    """The least and the greatest 1/z of a polygon's corners, with a little room."""
+    span[0], span[1] = 1e9, 0.0
+    for k in range(left):
+        span[0] = min(span[0], 0.98 / cam[k, 2])
+        span[1] = max(span[1], 1.02 / cam[k, 2])
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _rows_met(extent, grow, width, rows):
+    """First and last row that a polygon meets, of those ``[start, end)`` that are painted; the last is before the first
+    where it meets none."""
+    reach = 0.5 + grow
+    if extent[2] + reach < 0 or extent[0] - reach > width - 1:
+        return 0, -1
+    y0 = max(rows[0], int(np.ceil(max(extent[1] - reach, -1e6))))
+    y1 = min(rows[1] - 1, int(np.floor(min(extent[3] + reach, 1e6))))
+    return y0, y1
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _note_solid(n, mine, x0, x1, depth_x, depth0, least, most, depth_line, waiting_line, owner_line):
+    """Pixels that polygon ``n`` hides wholly: where it is the nearest they wait for it; how many are new and lost."""
+    slack = np.float32(_DEPTH_SLACK)
+    new, lost = 0, 0
+    for x in range(x0, x1 + 1):
+        inv = np.float32(min(max(depth_x * x + depth0, least), most))
+        if inv < depth_line[x] * slack:
+            lost += owner_line[x] != mine
+        else:
+            waiting_line[x] = n
+            depth_line[x] = inv
+            new += owner_line[x] != mine
+            owner_line[x] = mine
+    return new, lost
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _edge_distance(edges, used, x, y):
+    """Pixels from a pixel's centre to the nearest soft edge, negative outside."""
+    distance = 1e9
+    for k in range(used):
+        if edges[k, 3] > 0:
+            distance = min(distance, edges[k, 0] * x + edges[k, 1] * y + edges[k, 2])
+    return distance
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _scan(picture, tallies, bounds, shapes, looks, view, plan, shading):
     """Scan-convert all polygons. Whole pixels are only noted in ``waiting`` and shaded at the end (or when something is
     blended over them), so that what is painted over costs no texture reads."""
+    rgb, inverse_depth, owners, waiting = picture
+    drawn, rejected = tallies
+    corners, corner_count, soft, gradient, texture = shapes
+    owner, alpha, grow = looks
+    rotation, camera = view
     width = inverse_depth.shape[1]
-    texture = shading[1]
-    count = corners.shape[0]
-    depth_rows, rows, spans = plan
+    depth_rows, texture_rows, spans = plan
     whole, cam, screen = np.empty((MAX_CORNERS, 3)), np.empty((MAX_CORNERS + 2, 4)), np.empty((MAX_CORNERS + 2, 2))
-    edges = np.empty((MAX_CORNERS + 2, 4))
-    extent = np.empty(4)
+    edges, extent = np.empty((MAX_CORNERS + 2, 4)), np.empty(4)
     slack = np.float32(_DEPTH_SLACK)
-    for n in range(count):
+    for n in range(len(corners)):
         left = _clip_near(corners[n], corner_count[n], soft[n], rotation, whole, cam)
         if left < 3:
             continue
         used = _edges(cam, left, camera, screen, edges, extent)
         if used < 3 or not _inverse_depth_row(cam, left, camera, depth_rows[n]):
             continue
-        reach, mine = 0.5 + grow[n], np.uint8(owner[n])
-        y0 = max(first_row, int(np.ceil(max(extent[1] - reach, -1e6))))
-        y1 = min(last_row - 1, int(np.floor(min(extent[3] + reach, 1e6))))
-        if y0 > y1 or extent[2] + reach < 0 or extent[0] - reach > width - 1:
+        y0, y1 = _rows_met(extent, grow[n], width, bounds)
+        if y0 > y1:
             continue
-        spans[n, 0], spans[n, 1] = 1e9, 0.0
-        for k in range(left):
-            spans[n, 0] = min(spans[n, 0], 0.98 / cam[k, 2])
-            spans[n, 1] = max(spans[n, 1], 1.02 / cam[k, 2])
+        _inverse_depth_span(cam, left, spans[n])
         if texture[n] >= 0:
-            _texture_rows(gradient[n], rotation, camera, depth_rows[n], rows[n])
+            _texture_rows(gradient[n], rotation, camera, depth_rows[n], texture_rows[n])
+        reach, mine = 0.5 + grow[n], np.uint8(owner[n])
         for y in range(y0, y1 + 1):
             low, high, full_low, full_high = _row_bounds(edges, used, y, width, extent, grow[n])
             x0, x1 = int(np.ceil(low)), int(np.floor(high))
@@ -249,28 +296,17 @@ def _scan(
             depth_x, depth0 = depth_rows[n, 0], depth_rows[n, 1] * y + depth_rows[n, 2]
             least, most = spans[n, 0], spans[n, 1]
             depth_line, waiting_line, owner_line = inverse_depth[y], waiting[y], owners[y]
-            new, lost = 0, 0
-            for x in range(solid0, solid1 + 1):
-                inv = np.float32(min(max(depth_x * x + depth0, least), most))
-                if inv < depth_line[x] * slack:
-                    lost += owner_line[x] != mine
-                else:
-                    waiting_line[x] = n
-                    depth_line[x] = inv
-                    new += owner_line[x] != mine
-                    owner_line[x] = mine
+            new, lost = _note_solid(
+                n, mine, solid0, solid1, depth_x, depth0, least, most, depth_line, waiting_line, owner_line
+            )
             drawn[mine] += new
             rejected[mine] += lost
             for piece in range(2):
-                start, stop = (x0, min(solid0, x1 + 1)) if piece == 0 else (solid1 + 1, x1 + 1)
-                if piece == 1 and solid1 < solid0:
-                    continue
+                start, stop = (x0, solid0) if piece == 0 else (solid1 + 1, x1 + 1)
                 for x in range(start, stop):
                     distance = 1e9
                     if x < whole0 or x > whole1:
-                        for k in range(used):
-                            if edges[k, 3] > 0:
-                                distance = min(distance, edges[k, 0] * x + edges[k, 1] * y + edges[k, 2])
+                        distance = _edge_distance(edges, used, x, y)
                     cover = min(np.float32(1.0), np.float32(distance + reach)) * alpha[n]
                     if cover <= 0:
                         continue
@@ -278,8 +314,8 @@ def _scan(
                     if inv < depth_line[x] * slack:
                         rejected[mine] += owner_line[x] != mine
                         continue
-                    under = waiting[y, x]
-                    waiting[y, x] = -1
+                    under = waiting_line[x]
+                    waiting_line[x] = -1
                     for layer in range(0 if under >= 0 else 1, 2):
                         who, opacity = (under, np.float32(1.0)) if layer == 0 else (n, cover)
                         _shade(rgb, who, y, x, x + 1, plan, shading, opacity)
@@ -307,6 +343,55 @@ def _shade_waiting(rgb, waiting, first_row, last_row, plan, shading):
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy", inline="always")
+def _choose_reading(ux, vx, uy, vy, most_taps, levels):
+    """How a texture is read under a footprint.
+
+    Args:
+        ux, vx: texels that a step of one pixel to the right crosses.
+        uy, vy: and one of a pixel down.
+        most_taps: of its samples along the longer of the two, at most.
+        levels: how many it has.
+
+    Returns:
+        How many samples; the step between them (du, dv); the level, and the share of the one after it.
+    """
+    one, zero = np.float32(1.0), np.float32(0.0)
+    along_x, along_y = ux * ux + vx * vx, uy * uy + vy * vy
+    major, minor = max(along_x, along_y), min(along_x, along_y)
+    ratio = np.sqrt(major / max(minor, 1e-12))
+    taps = min(most_taps, max(1, int(np.ceil(ratio - 0.2))))
+    detail = max(0.0, 0.5 * np.log2(max(major, 1e-12) / (taps * taps)))
+    detail = min(detail, levels - 1.34)
+    level = int(detail)
+    # Levels blend over the middle third only: two thirds of the pixels then read one level, and no step shows.
+    blend = min(one, max(zero, (np.float32(detail - level) - np.float32(0.33)) * np.float32(3.0)))
+    if blend == one:
+        level, blend = level + 1, zero
+    if along_x > along_y:
+        du, dv = np.float32(ux / taps), np.float32(vx / taps)
+    else:
+        du, dv = np.float32(uy / taps), np.float32(vy / taps)
+    return taps, du, dv, level, blend
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy", inline="always")
+def _read(texels, u, v, taps, du, dv, shrink, weight0, weight1, start0, start1, width0, mask_u0, mask_v0):
+    """The texture about (u, v) of level 0: the sum of its weighted samples, packed as a texel is."""
+    half = np.float32(0.5)
+    centre = half * np.float32(taps - 1)
+    packed = np.int64(0)
+    for tap in range(taps):
+        shift = np.float32(tap) - centre
+        u1, v1 = (u + du * shift) * shrink, (v + dv * shift) * shrink
+        packed += _texel(texels, start0, width0, mask_u0, mask_v0, u1, v1, weight0)
+        if weight1 > np.float32(0.0):
+            u1 *= half
+            v1 *= half
+            packed += _texel(texels, start1, width0 - 1, mask_u0 >> 1, mask_v0 >> 1, u1, v1, weight1)
+    return packed
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy", inline="always")
 def _shade(rgb, n, y, x0, x1, plan, shading, cover):
     """Colour pixels ``[x0, x1)`` of row ``y`` by polygon ``n``; the level of detail is that of their middle."""
     depth_rows, rows, spans = plan
@@ -319,7 +404,7 @@ def _shade(rgb, n, y, x0, x1, plan, shading, cover):
     u_x, v_x = rows[n, 0, 0], rows[n, 1, 0]
     scale = np.float32(1.0 / 255.0 / 4096.0)
     half, zero = np.float32(0.5), np.float32(0.0)
-    taps, du, dv, weight0, weight1, centre, shrink = 1, zero, zero, zero, zero, zero, one
+    taps, du, dv, weight0, weight1, shrink = 1, zero, zero, zero, zero, one
     start0, start1, width0, mask_u0, mask_v0 = np.int64(0), np.int64(0), np.int64(0), 1, 1
     if texture >= 0:
         middle = 0.5 * (x0 + x1 - 1)
@@ -327,28 +412,13 @@ def _shade(rgb, n, y, x0, x1, plan, shading, cover):
         u, v = (u_x * middle + u_row) * z, (v_x * middle + v_row) * z
         ux, uy = (u_x - u * depth_x) * z, (rows[n, 0, 1] - u * depth_rows[n, 1]) * z
         vx, vy = (v_x - v * depth_x) * z, (rows[n, 1, 1] - v * depth_rows[n, 1]) * z
-        along_x, along_y = ux * ux + vx * vx, uy * uy + vy * vy
-        major, minor = max(along_x, along_y), min(along_x, along_y)
-        ratio = np.sqrt(major / max(minor, 1e-12))
-        taps = min(texture_taps[texture], max(1, int(np.ceil(ratio - 0.2))))
-        detail = max(0.0, 0.5 * np.log2(max(major, 1e-12) / (taps * taps)))
-        detail = min(detail, levels[texture] - 1.34)
-        level = int(detail)
-        # Levels blend over the middle third only: two thirds of the pixels then read one level, and no step shows.
-        blend = min(one, max(zero, (np.float32(detail - level) - np.float32(0.33)) * np.float32(3.0)))
-        if blend == one:
-            level, blend = level + 1, zero
+        taps, du, dv, level, blend = _choose_reading(ux, vx, uy, vy, texture_taps[texture], levels[texture])
         weight0 = (one - blend) * np.float32(4096.0) / np.float32(taps)
         weight1 = blend * np.float32(4096.0) / np.float32(taps)
-        centre = half * np.float32(taps - 1)
         shrink = one / np.float32(1 << level)
         start0, start1 = level_offset[texture, level], level_offset[texture, level + 1]
         width0 = np.int64(log_width[texture, level])
         mask_u0, mask_v0 = (1 << width0) - 1, (1 << np.int64(log_height[texture, level])) - 1
-        if along_x > along_y:
-            du, dv = np.float32(ux / taps), np.float32(vx / taps)
-        else:
-            du, dv = np.float32(uy / taps), np.float32(vy / taps)
     red, green, blue, fog = colours[n, 0], colours[n, 1], colours[n, 2], fogs[n]
     haze_r, haze_g, haze_b = haze[0], haze[1], haze[2]
     top, line = np.float32(255.0), rgb[y]
@@ -357,17 +427,10 @@ def _shade(rgb, n, y, x0, x1, plan, shading, cover):
         r, g, b = red, green, blue
         if texture >= 0:
             z = 1.0 / inv
-            u32 = np.float32((u_x * x + u_row) * z)
-            v32 = np.float32((v_x * x + v_row) * z)
-            packed = np.int64(0)
-            for tap in range(taps):
-                shift = np.float32(tap) - centre
-                u1, v1 = (u32 + du * shift) * shrink, (v32 + dv * shift) * shrink
-                packed += _texel(texels, start0, width0, mask_u0, mask_v0, u1, v1, weight0)
-                if weight1 > np.float32(0.0):
-                    u1 *= half
-                    v1 *= half
-                    packed += _texel(texels, start1, width0 - 1, mask_u0 >> 1, mask_v0 >> 1, u1, v1, weight1)
+            packed = _read(
+                texels, np.float32((u_x * x + u_row) * z), np.float32((v_x * x + v_row) * z), taps, du, dv, shrink,
+                weight0, weight1, start0, start1, width0, mask_u0, mask_v0,
+            )  # fmt: skip
             r *= np.float32(packed & 0x1FFFFF) * scale
             g *= np.float32((packed >> 21) & 0x1FFFFF) * scale
             b *= np.float32(packed >> 42) * scale

@@ -27,6 +27,23 @@ _KEEP_SHARE = 0.5
 _MIN_SCORE = 0.3
 _DRAWS = 400
 
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Size:
+    """How much is looked at."""
+
+    videos: int
+    """The first of the scenarios."""
+    frames: int
+    """Of each."""
+    clip_frames: int
+    stride_frames: int
+
+
+_WHOLE = _Size(videos=len(_SCENARIOS), frames=313, clip_frames=121, stride_frames=48)
+_QUICK = _Size(videos=5, frames=45, clip_frames=25, stride_frames=20)
+"""Drawing a frame and looking at it cost most, so clips are of a second; enough of them to be ranked wrongly."""
+
 LookPlan = Callable[[Timeline, Sequence[Span], PacketTimes], np.ndarray]
 
 
@@ -49,7 +66,7 @@ def chart(name: str, *, quick: bool = False) -> Chart:
     """
     detector = _open_detector()
     with tempfile.TemporaryDirectory() as folder:
-        videos = _make_videos(Path(folder), count=3 if quick else len(_SCENARIOS), frames=217 if quick else 313)
+        videos = _make_videos(Path(folder), _QUICK if quick else _WHOLE)
         frames = sum(len(video.packets.times_s) for video in videos)
         counts: dict[str, list[list[float]]] = {method: [] for method in _METHODS}
         seconds: dict[str, list[float]] = {method: [] for method in _METHODS}
@@ -85,16 +102,16 @@ def _open_detector() -> Detector:
     return Detector(card, path)
 
 
-def _make_videos(folder: Path, *, count: int, frames: int) -> list[_Video]:
+def _make_videos(folder: Path, size: _Size) -> list[_Video]:
     videos = []
-    for seed, scenario in enumerate(_SCENARIOS[:count]):
+    for seed, scenario in enumerate(_SCENARIOS[: size.videos]):
         path = folder / f"{scenario}.mp4"
         write_street_video(
-            StreetConfig(seed=900 + seed, scenario=scenario, frames=frames, width=_WIDTH, height=_HEIGHT), path
+            StreetConfig(seed=900 + seed, scenario=scenario, frames=size.frames, width=_WIDTH, height=_HEIGHT), path
         )
         packets = read_packet_times(path)
         timeline = plan_timeline(packets.times_s)
-        clips = plan_clips(timeline, clip_frames=121, stride_frames=48).kept
+        clips = plan_clips(timeline, clip_frames=size.clip_frames, stride_frames=size.stride_frames).kept
         videos.append(_Video(path=path, packets=packets, timeline=timeline, clips=clips))
     return videos
 

@@ -9,7 +9,7 @@ import numpy as np
 from labeling.errors import DataError
 from pipelines import ego_methods as methods
 from pipelines.charts import Chart, ChartPoint, Error, interleaved_ms, machine_name
-from pipelines.ego_clips import highway_clip, kitti_clip, street_clip
+from pipelines.ego_clips import TURNING_FRAME, highway_clip, kitti_clip, street_clip
 from pipelines.ego_errors import direction_errors_deg, rotation_errors_deg, window_errors_m
 from pipelines.ego_methods import EgoClip, Method
 
@@ -68,7 +68,7 @@ def _error(metric: str, unit: str, parts: list[np.ndarray]) -> Error:
 
 def _clips(quick: bool) -> list[EgoClip]:
     if quick:
-        return [street_clip("sharp_turn", frames=24)]
+        return [street_clip("sharp_turn", start=TURNING_FRAME, frames=30)]
     streets = [street_clip("sharp_turn"), street_clip("traffic"), highway_clip()]
     try:
         return [kitti_clip(frames=200), *streets]

@@ -7,8 +7,26 @@ from typing import Any, get_args, get_type_hints
 
 import typer
 
-USAGE_ERRORS: type[Exception] = typer.BadParameter.__mro__[2]
-"""What the parser raises: the class of click's that all its errors are of, wherever this typer keeps it."""
+_PARSER_ERROR = "ClickException"
+
+
+def parser_error(known: type[Exception]) -> type[Exception]:
+    """The class that all errors of the parser are of, found by its name above one of them that typer does show.
+
+    Raises:
+        ImportError: it is called otherwise, or does not say itself what is wrong.
+    """
+    for above in known.__mro__:
+        if above.__name__ == _PARSER_ERROR and issubclass(above, Exception) and hasattr(above, "format_message"):
+            return above
+    raise ImportError(
+        f"this typer's {known.__name__} is no {_PARSER_ERROR} with a format_message, so errors of the command line "
+        "could not be told; install the typer that constraints.txt names"
+    )
+
+
+USAGE_ERRORS = parser_error(typer.BadParameter)
+"""What the parser raises, wherever this typer keeps click's errors."""
 
 
 def print_usage_error(error: Exception) -> None:

@@ -1,6 +1,7 @@
 """The command line's second half: training, sampling and measuring. As light to import as the first."""
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,6 +10,14 @@ import typer
 from pipelines.cli_options import MEASURE, STOPPED, TRAIN, Effort, Extractors, JobFolder, Models, Workers
 
 commands = typer.Typer()
+
+# generate has many options, which its help shows by what they are for. They stay parameters, one each: typer reads a
+# command's options off its signature alone, and what they are passed on in are records.
+_adapters = partial(typer.Option, rich_help_panel="Adapters")
+_picture = partial(typer.Option, rich_help_panel="Start from a picture")
+_clips = partial(typer.Option, rich_help_panel="Start from a job's clips")
+_conditions = partial(typer.Option, rich_help_panel="Given beside the start")
+_sampler = partial(typer.Option, rich_help_panel="Sampling")
 
 
 @commands.command(rich_help_panel=TRAIN)
@@ -65,35 +74,33 @@ def _tell_stale(job: Path) -> None:
 @commands.command(rich_help_panel=TRAIN)
 def generate(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the videos.")],
-    motion: Annotated[Path | None, typer.Option(help="Adapter of the motion stage.")] = None,
-    appearance: Annotated[Path | None, typer.Option(help="Adapter of the appearance stage.")] = None,
-    end_to_end: Annotated[Path | None, typer.Option(help="Adapter of the baseline, instead of both.")] = None,
-    image: Annotated[Path | None, typer.Option(help="The first frame.")] = None,
-    caption: Annotated[str | None, typer.Option(help="What the clip shows.")] = None,
-    data: Annotated[Path | None, typer.Option(help="A job: start from one of its clips instead.")] = None,
-    clip: Annotated[str | None, typer.Option(help="Which clip of the job; by default the first.")] = None,
-    clips: Annotated[
-        str | None, typer.Option(help="Many clips of the job: val, train, all, or keys with commas.")
-    ] = None,
+    motion: Annotated[Path | None, _adapters(help="Adapter of the motion stage.")] = None,
+    appearance: Annotated[Path | None, _adapters(help="Adapter of the appearance stage.")] = None,
+    end_to_end: Annotated[Path | None, _adapters(help="Adapter of the baseline, instead of both.")] = None,
+    backbone: Annotated[str | None, _adapters(help="By default the adapters' own.")] = None,
+    image: Annotated[Path | None, _picture(help="The first frame.")] = None,
+    skeleton: Annotated[Path | None, _picture(help="The first skeleton; by default extracted.")] = None,
+    data: Annotated[Path | None, _clips(help="A job: start from one of its clips instead.")] = None,
+    clip: Annotated[str | None, _clips(help="Which clip of the job; by default the first.")] = None,
+    clips: Annotated[str | None, _clips(help="Many clips of the job: val, train, all, or keys with commas.")] = None,
     true_skeletons: Annotated[
-        bool, typer.Option("--true-skeletons", help="With --clips: paint over the clips' own skeletons.")
+        bool, _clips("--true-skeletons", help="With --clips: paint over the clips' own skeletons.")
     ] = False,
     object_variant: Annotated[
-        int | None, typer.Option(help="With --clips: condition on this object video of each clip too.")
+        int | None, _clips(help="With --clips: condition on this object video of each clip too.")
     ] = None,
-    skeleton: Annotated[Path | None, typer.Option(help="The first skeleton; by default extracted.")] = None,
-    skeleton_video: Annotated[Path | None, typer.Option(help="All skeletons, instead of the motion stage.")] = None,
-    ego: Annotated[str | None, typer.Option(help="Trajectory file, or words such as 'straight 10m/s'.")] = None,
-    objects: Annotated[Path | None, typer.Option(help="Object video, or labels in Parquet.")] = None,
-    backbone: Annotated[str | None, typer.Option(help="By default the adapters' own.")] = None,
-    samples: Annotated[int, typer.Option(min=1)] = 1,
-    seed: Annotated[int, typer.Option()] = 0,
-    steps: Annotated[int, typer.Option(min=1, help="Denoising steps per stage.")] = 30,
-    guidance: Annotated[float, typer.Option(help="Classifier-free guidance.")] = 3.0,
+    caption: Annotated[str | None, _conditions(help="What the clip shows.")] = None,
+    skeleton_video: Annotated[Path | None, _conditions(help="All skeletons, instead of the motion stage.")] = None,
+    ego: Annotated[str | None, _conditions(help="Trajectory file, or words such as 'straight 10m/s'.")] = None,
+    objects: Annotated[Path | None, _conditions(help="Object video, or labels in Parquet.")] = None,
+    samples: Annotated[int, _sampler(min=1)] = 1,
+    seed: Annotated[int, _sampler()] = 0,
+    steps: Annotated[int, _sampler(min=1, help="Denoising steps per stage.")] = 30,
+    guidance: Annotated[float, _sampler(help="Classifier-free guidance.")] = 3.0,
     coordinates: Annotated[
-        Literal["consistent", "released"], typer.Option(help="consistent, or released with the released adapters.")
+        Literal["consistent", "released"], _sampler(help="consistent, or released with the released adapters.")
     ] = "consistent",
-    frames: Annotated[int | None, typer.Option(help="By default what the adapters were trained on.")] = None,
+    frames: Annotated[int | None, _sampler(help="By default what the adapters were trained on.")] = None,
     extractors: Extractors = None,
     models: Models = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from dataset.layout import JOB_FILE, SELECTION
 from dataset.receipts import Receipt, make_folder
-from dataset.selection import check_split, read_selection
+from dataset.selection import check_split, read_selection, twin_holders
 from labeling.captions import read_caption_table
 from labeling.ego_import import FileClock
 from labeling.errors import ConfigError
@@ -278,7 +278,7 @@ def _finish(job: Job, reports: Sequence[StageReport], reporter: ConsoleReporter)
     if stages & {"index", "cut"}:
         print_damaged(damaged_videos(job), reporter.console)
     if "select" in stages and (job.root / SELECTION).is_file():
-        print_twins(read_selection(job.root / SELECTION), reporter.console)
+        print_twins(twin_holders(read_selection(job.root / SELECTION)), reporter.console)
     if _is_empty(job, stages):
         reporter.console.print(f"[red]{escape(why_nothing_is_left(job.root))}[/]")
         return 1

@@ -1,18 +1,19 @@
 """The settings of a job: nested, strict, in YAML; and its presets, which are functions that return one."""
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from dataset.shards import Split
+from labeling.efforts import Effort
 from labeling.ego_motion import EgoSettings
+from labeling.ego_video import EgoRenderer, EgoStyle
 from labeling.encoding import EncoderSettings, lossless_rgb
 from labeling.settings_files import laid_over, parse_settings
 from labeling.timeline import ClipSettings
 
-Effort = Literal["fast", "balanced", "exact"]
-EFFORTS: tuple[Effort, ...] = ("fast", "balanced", "exact")
-
+EFFORTS: tuple[Effort, ...] = get_args(Effort)
 COUNTED_CLASSES = ("car", "truck", "bus", "motorcycle", "bicycle", "person")
 
 
@@ -81,7 +82,7 @@ class SelectSettings(Settings):
     """How many of the kept clips to take, by rank of hash(seed, key); all by default."""
     val_share: float = Field(default=0.1, ge=0, lt=1)
     """Share of the source videos that go to val, by hash(seed, video id)."""
-    split: dict[str, Literal["train", "val"]] | None = None
+    split: dict[str, Split] | None = None
     """The split of each video by name, instead of the hash (``--split FILE``)."""
 
     @property
@@ -119,8 +120,8 @@ class ViewSettings(Settings):
     """Lossless, in RGB: 4:2:0 loses the skeletons' colours."""
     view_encoder: EncoderSettings = EncoderSettings()
     """For ego and object videos."""
-    ego_style: Literal["world", "released"] = "world"
-    ego_renderer: Literal["remap", "pyvista"] = "remap"
+    ego_style: EgoStyle = "world"
+    ego_renderer: EgoRenderer = "remap"
     ego_seed: int = 0
     object_variant: int = 0
     """Another number chooses other tracks."""

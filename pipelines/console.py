@@ -10,7 +10,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from dataset.receipts import Receipt, reason_counts
-from dataset.selection import Selection, twin_holders
 from pipelines.label import StageReport
 
 
@@ -120,11 +119,11 @@ def print_damaged(lines: Sequence[str], console: Console, *, most: int = 3) -> N
         console.print(f"[yellow]damaged[/] {escape(line)}")
 
 
-def print_twins(selection: Selection, console: Console, *, most: int = 3) -> None:
-    """Which videos are dropped because others have the same bytes; of many, the first ``most``."""
+def print_twins(holders: Mapping[str, str], console: Console, *, most: int = 3) -> None:
+    """Which videos are dropped because others, by video id, have the same bytes; of many, the first ``most``."""
     lines = [
         f"{name} is {holder} again, byte for byte: its clips are dropped (same_as)"
-        for name, holder in sorted(twin_holders(selection).items())
+        for name, holder in sorted(holders.items())
     ]
     for line in shortened(lines, most):
         console.print(f"[yellow]note[/] {escape(line)}")

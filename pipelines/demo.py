@@ -64,7 +64,8 @@ class TruthFigures:
     car_recall: float
     """Of cars at least 32 px high and 30 % visible, found with an overlap of 0.3 by a label that no other car has."""
     car_precision: float
-    """Of labelled cars, those that are a true one, however small, found so."""
+    """Of labelled cars, those that are a true one, found so; what is none, but lower than 32 px or on a car that is not
+    looked for, is left out."""
     cars: int
     """True cars that were looked for."""
     point_error_px: float
@@ -208,6 +209,7 @@ def train_and_generate(job: Path, out: Path, sample: Sample) -> tuple[dict[str, 
     import torch
 
     from pipelines.train import GenerateOptions, run_cache, run_generate, run_train
+    from training.adapter_notes import adapter_file
 
     # One thread: the tiny network gains nothing from more, and loses much where cores are shared.
     torch.set_num_threads(1)
@@ -220,7 +222,7 @@ def train_and_generate(job: Path, out: Path, sample: Sample) -> tuple[dict[str, 
             stage, data=job, config="tiny", out=folder, overrides={"optimiser": {"steps": TRAIN_STEPS}},
             on_step=lambda step, loss: None,
         )  # fmt: skip
-        adapters[stage] = getattr(summary, "adapter", folder / "adapter.safetensors")
+        adapters[stage] = getattr(summary, "adapter", adapter_file(folder))
         losses[stage] = _logged_losses(folder / "metrics.jsonl")
     files = run_generate(
         out=out / "generated", motion=adapters["motion"], appearance=adapters["appearance"], data=job,
@@ -265,7 +267,8 @@ def _truth_section(truth: TruthFigures) -> Section:
         (
             "labels that are cars",
             f"{truth.car_precision:.1%}",
-            "of true cars of any size; IoU 0.3",
+            "a true car, IoU 0.3; what is none counts as wrong if 32 px high and not on a car too low or hidden to be "
+            "looked for",
         ),
         ("car points", f"{truth.point_error_px:.2f} px", "median distance, visible points of found cars"),
         (

@@ -17,6 +17,8 @@ from pipelines.ego_methods import EgoClip
 
 WIDTH, HEIGHT = 480, 320
 SECONDS = 5
+TURNING_FRAME = 36
+"""Of the street's sharp turn: it is well under way."""
 
 
 def real_folder() -> Path:
@@ -66,15 +68,15 @@ def kitti_part() -> EgoClip | None:
 
 @cache
 def street_clip(
-    scenario: Scenario, *, frames: int = 24 * SECONDS, seed: int = 1, pitch_deg: float = 0.0, fps: float = 24.0
-) -> EgoClip:
-    """A rendered street drive."""
-    return _rendered(
-        StreetConfig(
-            seed=seed, width=WIDTH, height=HEIGHT, frames=frames, scenario=scenario, camera_pitch_deg=pitch_deg, fps=fps
-        ),
-        scenario,
-    )
+    scenario: Scenario, *, frames: int = 24 * SECONDS, seed: int = 1, pitch_deg: float = 0.0, fps: float = 24.0,
+    start: int = 0,
+) -> EgoClip:  # fmt: skip
+    """A rendered street drive, from its frame ``start`` on."""
+    config = StreetConfig(
+        seed=seed, width=WIDTH, height=HEIGHT, frames=start + frames, scenario=scenario, camera_pitch_deg=pitch_deg,
+        fps=fps,
+    )  # fmt: skip
+    return _rendered(config, scenario, start=start)
 
 
 @cache
@@ -99,10 +101,10 @@ def _rendered(config: StreetConfig, name: str, *, start: int = 0) -> EgoClip:
     )  # fmt: skip
 
 
-def rolling_clip(*, start: int = 36, frames: int = 40, readout_s: float = 0.03) -> EgoClip:
+def rolling_clip(*, start: int = TURNING_FRAME, frames: int = 40, readout_s: float = 0.03) -> EgoClip:
     """The middle of a sharp turn through a rolling shutter.
 
-    It starts where the turn is well under way: while a turn begins, half a readout is a share of the yaw so far.
+    While a turn begins, half a readout is a share of the yaw so far.
     """
     config = StreetConfig(
         seed=1, width=WIDTH, height=HEIGHT, frames=start + frames, scenario="sharp_turn", rolling_shutter_s=readout_s

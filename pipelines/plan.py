@@ -25,12 +25,14 @@ from pipelines.engine import Engine
 from pipelines.job import Job
 from pipelines.label import ALL_STAGES, Reporter, StageReport, run_stages
 from pipelines.models import check_models_folder
-from pipelines.sources import Source, find_videos, with_leave_out
+from pipelines.sources import Source, find_videos, likely_twins, with_leave_out
 from pipelines.stage import Part
 from pipelines.stages_source import packet_facts
 from pipelines.trial_windows import SourceClips, plan_windows, read_clips
 
 CALIBRATION_S = 60.0
+_WARM_UP_FRAMES = 25
+"""Of a clip: enough for every stage to have something to do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,13 +53,16 @@ class JobPlan:
     """Videos that cannot be opened, with the reason."""
     damaged: tuple[str, ...]
     """Videos that are less than they claim, as far as is known: files cut off, and those that were measured on."""
+    twins: dict[str, str]
+    """By video id, the video that has the same bytes and is counted in its place."""
     too_short: int
     """Videos that are shorter than a clip, less what is left out of them."""
     clip_frames: int
     """Of one clip."""
     source_hours: float
     clips: int
-    """Candidates: all that fit on the videos' timelines; of the videos that were measured on, those without a hole."""
+    """Candidates: all that fit on the videos' timelines, twins' left out; of the videos that were measured on, those
+    without a hole."""
     kept_clips: int
     """Kept by their objects."""
     sampled_clips: int
@@ -109,33 +114,37 @@ def plan_job(
         sources = list(with_leave_out(by_id, options.leave_out).values())
     lengths, cut_off, broken = _lengths_s(sources)
     candidates = {name: count_candidates(length, config.clip) for name, length in lengths.items()}
-    usable = [source for source in sources if candidates.get(source.video_id)]
+    long_enough = [source for source in sources if candidates.get(source.video_id)]
+    twins = likely_twins([source for source in sources if source.video_id in lengths])
+    usable = [source for source in long_enough if source.video_id not in twins]
     if not usable:
         raise ConfigError(
             f"none of {len(sources)} videos is long enough for one clip of {config.clip.clip_frames} frames "
             f"({_clip_s(config.clip):g} s); give longer videos, or a smaller clip.clip_frames with --config"
         )
-    too_short = len(lengths) - len(usable)
     clips_of = functools.cache(functools.partial(read_clips, clip=config.clip))
     receipts = _calibrate(usable, clips_of, config, options.models, seconds=calibration_s)
     measured = _Measured.of(receipts)
     candidates |= {
         source.video_id: len(clips_of(source).clips) for source in usable if source.video_id in receipts["index"]
     }
-    total = sum(candidates.values())
+    judged = {name: count for name, count in candidates.items() if name not in twins}
+    total = sum(judged.values())
     kept = max(1, round(total * measured.kept_clips / measured.clips))
     sampled = min(kept, config.select.sample_clips or kept)
     looked = {name: receipt.facts for name, receipt in receipts["index"].items()}
     damaged = damage_lines(cut_off | looked, receipts["cut"].values())
     return JobPlan(
-        videos=len(lengths), broken=broken, damaged=tuple(damaged),
-        too_short=too_short, clip_frames=config.clip.clip_frames,
+        videos=len(lengths), broken=broken, damaged=tuple(damaged), twins=twins,
+        too_short=len(lengths) - len(long_enough), clip_frames=config.clip.clip_frames,
         source_hours=sum(lengths.values()) / 3600,
         clips=total, kept_clips=kept, sampled_clips=sampled, clip_hours=sampled * _clip_s(config.clip) / 3600,
-        stages=_scaled(receipts, measured, lengths, candidates=candidates, sampled=sampled),
+        stages=_scaled(
+            receipts, measured, lengths, candidates=judged, counted=sum(candidates.values()), sampled=sampled
+        ),
         calibration_s=measured.window_s, calibration_clips=measured.kept_clips,
         calibration_videos=measured.videos, workers=workers, parts=parts,
-        largest_part=_largest_part(lengths, parts),
+        largest_part=_largest_part({name: length for name, length in lengths.items() if name not in twins}, parts),
     )  # fmt: skip
 
 
@@ -193,7 +202,7 @@ def _calibrate(
     *,
     seconds: float,
 ) -> dict[str, dict[str, Receipt]]:
-    """Receipts of a small job on windows of videos; one on a single clip before it pays for loading and compiling.
+    """Receipts of a small job on windows of videos; one on a second before it pays for loading and compiling.
 
     Raises:
         ConfigError: no video holds a whole clip.
@@ -205,10 +214,13 @@ def _calibrate(
             f"none of {len(sources)} videos holds a clip of {_clip_s(clip):g} s without a hole, so none would be kept; "
             "give recordings without gaps, or a smaller clip.clip_frames with --config"
         )
-    (warm_up,) = plan_windows(sources, clips_of, clip_frames=clip.clip_frames, seconds=0)
+    short = clip.model_copy(update={"clip_frames": min(clip.clip_frames, _WARM_UP_FRAMES)})
+    (warm_up,) = plan_windows(
+        sources, lambda source: clips_of(source).cut_to(short.clip_frames), clip_frames=short.clip_frames, seconds=0
+    )
     unsampled = config.model_copy(update={"select": config.select.model_copy(update={"sample_clips": None})})
     with tempfile.TemporaryDirectory(prefix="animatic-plan-") as scratch:
-        _run(Path(scratch) / "warm-up", [warm_up], unsampled, models_dir)
+        _run(Path(scratch) / "warm-up", [warm_up], unsampled.model_copy(update={"clip": short}), models_dir)
         return _run(Path(scratch) / "job", windows, unsampled, models_dir)
 
 
@@ -266,15 +278,16 @@ def _scaled(
     lengths_s: dict[str, float],
     *,
     candidates: dict[str, int],
+    counted: int,
     sampled: int,
 ) -> tuple[StageCost, ...]:
-    """Costs of the whole job: reading grows with the footage, counting with its clips, the rest with what is taken; of
-    a video's camera only so much is looked at."""
+    """Costs of the whole job: reading grows with the footage, counting with its clips (``counted``, twins' as well),
+    the rest with what is taken; of a video's camera only so much is looked at."""
     clips = sum(candidates.values())
     taken = {name: count * sampled / clips * measured.frames_per_clip for name, count in candidates.items()}
     looked = sum(min(frames, ROAD_FRAMES) for frames in taken.values())
     by_length = sum(lengths_s.values()) / max(measured.video_s, 1e-9)
-    factors = {"source": by_length, "index": by_length, "count": clips / measured.clips, "select": 1.0}
+    factors = {"source": by_length, "index": by_length, "count": counted / measured.clips, "select": 1.0}
     factors["camera"] = looked / max(measured.camera_frames, 1)
     costs = []
     for stage, made in receipts.items():

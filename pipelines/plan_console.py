@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipelines.commands import JobOptions
-from pipelines.console import counted, make_console, print_damaged
+from pipelines.console import counted, make_console, print_damaged, print_twins
 from pipelines.plan import JobPlan, plan_job
 
 
@@ -30,6 +30,7 @@ def show_plan(videos: Sequence[Path], options: JobOptions, *, parts: int, as_jso
     for reason in plan.broken:
         console.print(f"[red]left out[/] {escape(reason)}")
     print_damaged(plan.damaged, console)
+    print_twins(plan.twins, console)
     if plan.too_short:
         verb = "is" if plan.too_short == 1 else "are"
         console.print(

@@ -1,5 +1,6 @@
 """The source videos of a job: how a person names them, and how ``job.yaml`` keeps them."""
 
+import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -14,6 +15,8 @@ from pipelines.given_tables import read_leave_out, two_lengths
 VIDEO_SUFFIXES = frozenset({".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v", ".ts", ".mts", ".mpg", ".mpeg", ".flv"})
 _OTHER_FOLDER = "give the folder of the videos, and --out another one (a job that is there goes on without any VIDEO)"
 _MOST_NAMED = 8
+_SAMPLES, _SAMPLE_BYTES = 16, 1 << 20
+"""Places of a file that are compared, of which neighbours overlap in a small file."""
 _LIST_SUFFIXES = frozenset({".txt", ".lst", ".list", ".tsv"})
 
 
@@ -107,6 +110,33 @@ def with_leave_out(sources: Mapping[str, Source], table: Path) -> dict[str, Sour
         raise ConfigError(f"{table}: names {unknown[0]!r}, which is none of the videos; use ids, as {_some(sources)}")
     named = {video_id: replace(sources[video_id], leave_out_s=span) for video_id, span in spans.items()}
     return {**sources, **named}
+
+
+def likely_twins(sources: Sequence[Source]) -> dict[str, str]:
+    """By video id, the first of the videos that seem to have the same bytes; none for those that are the first.
+
+    The job compares whole files. Here files of one size are, by what lies at some places of them: all of a small one.
+    """
+    by_size: dict[int, list[Source]] = {}
+    for source in sorted(sources, key=lambda source: source.video_id):
+        by_size.setdefault(source.path.stat().st_size, []).append(source)
+    twins: dict[str, str] = {}
+    for size, alike in by_size.items():
+        first: dict[str, str] = {}
+        for source in alike if len(alike) > 1 else ():
+            holder = first.setdefault(_sampled_sha256(source.path, size), source.video_id)
+            if holder != source.video_id:
+                twins[source.video_id] = holder
+    return twins
+
+
+def _sampled_sha256(path: Path, size: int) -> str:
+    seen = hashlib.sha256()
+    with path.open("rb") as stream:
+        for number in range(_SAMPLES):
+            stream.seek(max(0, size - _SAMPLE_BYTES) * number // (_SAMPLES - 1))
+            seen.update(stream.read(_SAMPLE_BYTES))
+    return seen.hexdigest()
 
 
 def same_id(video_id: str, first: Path, second: Path) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from dataset.layout import JOB_FILE, SELECTION, counts_path, index_path
-from dataset.receipts import digest, reason_counts
+from dataset.receipts import check_unaltered, digest, reason_counts
 from dataset.selection import (
     ClipRow,
     SelectionRule,
@@ -176,7 +176,8 @@ class SelectStage:
         return [
             WorkItem(
                 stage=self.name, name="selection", owner="", version=1, settings=settings,
-                inputs={"videos": videos}, outputs=(SELECTION,), payload={"mode": job.selection_mode},
+                inputs={"videos": videos}, outputs=(SELECTION,),
+                payload={"mode": job.selection_mode, "previous": _previous_sha256(job)},
             )
         ]  # fmt: skip
 
@@ -184,8 +185,11 @@ class SelectStage:
         """Write ``selection.parquet``.
 
         Raises:
+            AlteredError: a video's index or counts, or the selection so far, are not as they were written.
             ConfigError: the mode or the split does not fit.
         """
+        if item.payload["previous"] and (root / SELECTION).is_file():
+            check_unaltered(root / SELECTION, item.payload["previous"])
         settings = parse_settings(SelectSettings, item.settings["select"], "select")
         clip = ClipSettings.model_validate(item.settings["clip"])
         videos = item.inputs["videos"]
@@ -251,10 +255,12 @@ def _counting(job: Job) -> dict[str, Any]:
 def _candidates(
     root: Path, video_id: str, facts: Mapping[str, Any], settings: SelectSettings, clip: ClipSettings
 ) -> list[ClipRow]:
+    check_unaltered(root / index_path(video_id), facts["index"])
     index = read_index(root / index_path(video_id))
     timeline, plan = clip_plan(index, clip, tuple(facts["leave_out_s"]))
     if facts["counts"] is None:
         return candidate_rows(video_id, plan, None)
+    check_unaltered(root / counts_path(video_id), facts["counts"])
     counts, _ = read_table(root / counts_path(video_id), COUNTS_SCHEMA)
     objects = count_objects(
         timeline, plan.kept, look_times_s=np.array(counts["time_s"].to_pylist(), dtype=np.float64),
@@ -276,6 +282,12 @@ def _refuse_passing_failures(job: Job) -> None:
                     f"{receipt.item} is not counted: {receipt.message}; run the command again, or take the video out "
                     f"of {job.root / JOB_FILE} to go on without it"
                 )
+
+
+def _previous_sha256(job: Job) -> str | None:
+    """Of the selection so far, whose threshold, sample and split hold on."""
+    receipt = job.receipts(SelectStage.name).get("selection")
+    return receipt.outputs[0].sha256 if receipt is not None and receipt.outputs else None
 
 
 def _previous(root: Path) -> Any:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from labeling.boxes import iou
+from labeling.boxes import best_pairs
 from labeling.camera import Intrinsics
 from labeling.detection import Detector
 from labeling.ego_motion import estimate_ego_motion
@@ -98,8 +98,8 @@ def _read_back(clip: StudyClip, video: np.ndarray) -> list[float]:
 
 
 def _hits(clip: StudyClip, index: int, boxes: np.ndarray) -> list[float]:
+    """For each car that is asked for, 1 where a box is its own: none stands for two of them."""
     asked = [car.box_xyxy for car in clip.cars()[index] if is_counted(car.box_xyxy, car.visible_share)]
-    if not asked:
-        return []
-    overlaps = iou(np.array(asked, np.float64), np.asarray(boxes, np.float64).reshape(-1, 4))
-    return [float(row.max(initial=0.0) >= MATCH_IOU) for row in overlaps]
+    true, found = (np.array(some, np.float64).reshape(-1, 4) for some in (asked, boxes))
+    own = {row for row, _, _ in best_pairs(true, found, least_iou=MATCH_IOU)}
+    return [float(row in own) for row in range(len(asked))]

@@ -18,9 +18,8 @@ from pipelines.black_skeletons import print_black_skeletons
 from pipelines.console import counted, counting_bar, file_size, make_console
 from pipelines.stage import parse_part
 from training.adapter_notes import read_progress
-from training.config import STAGES, Stage, load_config
+from training.config import STAGES, Convention, Stage, load_config
 from training.dry_run import RunPlan
-from training.flow import Convention
 from training.generation import GeneratedFiles, generate
 from training.latents import CacheSummary, cache_latents
 from training.sampling_inputs import LabelledFrame

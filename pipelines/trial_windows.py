@@ -25,6 +25,10 @@ class SourceClips:
         """Seconds to leave out at the start and at the end so that only ``clips`` are left, half a frame to spare."""
         return max(0.0, (clips[0].start - 0.5) / FPS), max(0.0, (self.frames - clips[-1].end - 0.5) / FPS)
 
+    def cut_to(self, frames: int) -> "SourceClips":
+        """The first ``frames`` of each clip alone."""
+        return replace(self, clips=tuple(replace(clip, end=min(clip.end, clip.start + frames)) for clip in self.clips))
+
 
 def read_clips(source: Source, clip: ClipSettings) -> SourceClips:
     """The clips of a video, from its packets.

@@ -1,8 +1,10 @@
 """The chart of counting looks: what counts as a clip kept wrongly."""
 
+import numpy as np
 import pytest
 
-from pipelines.charts_count import _missed
+from labeling.timeline import plan_clips, plan_timeline
+from pipelines.charts_count import _QUICK, _SCENARIOS, _WHOLE, _missed
 
 
 @pytest.mark.parametrize(
@@ -18,3 +20,11 @@ from pipelines.charts_count import _missed
 def test_too_many_and_too_few_count_alike(counts, truth, missed) -> None:
     """Half of four clips are kept, and all of those that tie."""
     assert _missed(counts, truth) == missed
+
+
+@pytest.mark.parametrize("size", [_WHOLE, _QUICK], ids=["whole", "quick"])
+def test_every_video_has_clips_to_rank(size) -> None:
+    timeline = plan_timeline(np.arange(size.frames) / 24)
+    clips = plan_clips(timeline, clip_frames=size.clip_frames, stride_frames=size.stride_frames).kept
+    assert len(clips) >= 2 and 2 < size.videos <= len(_SCENARIOS)
+    assert _QUICK.videos * _QUICK.frames < _WHOLE.videos * _WHOLE.frames / 10

@@ -1,10 +1,15 @@
 """The command line's own errors: one line on standard error that names the option, and exit code 2."""
 
 import sys
+from typing import get_args, get_type_hints
 
 import pytest
+import typer
 
 from pipelines.cli import app, main
+from pipelines.cli_errors import USAGE_ERRORS, parser_error
+from pipelines.cli_training import generate
+from training.config import Convention
 
 
 def words_of(value):
@@ -90,3 +95,23 @@ def test_an_empty_path_names_no_folder(run, tmp_path, words, name):
 def test_a_text_may_be_empty(run):
     _, _, err = run("cache", "J", "--backbone", "tiny", "--controls", "")
     assert "is empty" not in err
+
+
+def test_the_parsers_errors_are_those_of_this_typer():
+    assert USAGE_ERRORS in typer.BadParameter.__mro__ and USAGE_ERRORS.__name__ == "ClickException"
+    assert USAGE_ERRORS("words").format_message() == "words"  # type: ignore[attr-defined]
+    assert not issubclass(typer.Exit, USAGE_ERRORS) and not issubclass(typer.Abort, USAGE_ERRORS)
+
+
+@pytest.mark.parametrize(
+    "known", [KeyError, type("ClickException", (Exception,), {})], ids=["no such name", "by its name alone"]
+)
+def test_a_typer_that_keeps_no_such_error_is_said(known):
+    with pytest.raises(ImportError, match=f"this typer's {known.__name__} is no ClickException .* constraints.txt"):
+        parser_error(known)
+
+
+def test_choices_of_generate_are_those_of_the_sampler():
+    """The command line spells them out, since it loads no settings before a command is called."""
+    coordinates = get_type_hints(generate)["coordinates"]
+    assert get_args(coordinates) == get_args(Convention)

@@ -188,6 +188,8 @@ def test_the_chart_tells_its_methods_apart(tmp_path):
     default, stock = "ladder at 1/2 (default)", "stock findEssentialMat + recoverPose"
     assert away_m[default] < 0.02 * away_m["constant zero"]
     assert turned_deg[default] < 0.5 * turned_deg[stock]
+    assert turned_deg["constant forward speed"] > 1, "the drive does not turn"
+    assert away_m[default] < 0.05 * away_m["constant forward speed"]
 
 
 def test_names_of_methods_stand_by_themselves():

@@ -1,6 +1,7 @@
 """The plan against the truth of the job that then runs: clips and bytes here, hours in a benchmark."""
 
 import json
+import shutil
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -13,7 +14,7 @@ from pipeline_fixtures import SMALL, run_all, small_config, write_detector, writ
 from video_fixtures import write_source
 
 from dataset.receipts import Receipt
-from dataset.selection import read_selection
+from dataset.selection import read_selection, twin_holders
 from labeling.ego_calibration import ROAD_FRAMES
 from labeling.errors import ConfigError
 from labeling.timeline import ClipSettings, plan_clips, plan_timeline
@@ -21,7 +22,7 @@ from pipelines.commands import JobOptions
 from pipelines.job import Job
 from pipelines.plan import _Measured, _scaled, count_candidates, plan_job
 from pipelines.plan_console import hours, show_plan, size
-from pipelines.sources import Source, find_videos
+from pipelines.sources import Source, find_videos, likely_twins
 from pipelines.trial_windows import SourceClips, plan_windows
 
 
@@ -51,6 +52,37 @@ def test_clips_and_bytes_are_within_thirty_percent(tmp_path: Path, videos: Path,
     made = sum(path.stat().st_size for path in job.root.rglob("*") if path.is_file() and "receipts" not in path.parts)
     assert plan.disk_bytes == pytest.approx(made, rel=0.3)
     assert plan.core_hours > 0 and plan.hours_per_host == pytest.approx(plan.core_hours)
+
+
+def test_twins_count_once_as_in_the_job(
+    tmp_path: Path, videos: Path, options: JobOptions, capsys: pytest.CaptureFixture[str]
+) -> None:
+    once = plan_job([videos], options, workers=1, calibration_s=6.0)
+    shutil.copytree(videos, tmp_path / "videos")
+    shutil.copy(videos / "v1.mp4", tmp_path / "videos" / "v3.mp4")
+    twice = plan_job([tmp_path / "videos"], options, workers=1, calibration_s=6.0)
+    assert twice.twins == {"v3": "v1"} and (twice.videos, once.videos) == (4, 3)
+    assert (twice.clips, twice.kept_clips) == (once.clips, once.kept_clips)
+    job = Job(
+        tmp_path / "J", small_config(select={"keep_share": 0.3}),
+        {source.video_id: source for source in find_videos([tmp_path / "videos"])}, models_dir=options.models,
+    )  # fmt: skip
+    run_all(job, stages=("source", "index", "count", "select"))
+    chosen = read_selection(job.root / "selection.parquet")
+    assert twin_holders(chosen) == twice.twins
+    assert twice.clips == len([row for row in chosen.rows if row.video_id not in twice.twins])
+    assert show_plan([tmp_path / "videos"], options, parts=1, as_json=False) == 0
+    assert "v3 is v1 again, byte for byte" in " ".join(capsys.readouterr().out.split())
+
+
+def test_files_of_one_size_are_twins_where_they_agree(tmp_path: Path) -> None:
+    data = np.random.default_rng(0).integers(0, 256, 20 << 20, np.uint8)
+    others = {"a": data, "b": data, "c": data.copy(), "d": data[:-1]}
+    others["c"][len(data) // 2 :] ^= 1
+    sources = [Source(video_id=name, path=tmp_path / f"{name}.mp4") for name in reversed(others)]
+    for name, content in others.items():
+        (tmp_path / f"{name}.mp4").write_bytes(content.tobytes())
+    assert likely_twins(sources) == {"b": "a"}
 
 
 def test_parts_share_the_footage(videos: Path, options: JobOptions, capsys: pytest.CaptureFixture[str]) -> None:
@@ -96,6 +128,16 @@ def test_no_window_falls_between_the_clips(length_s: float, seconds: float) -> N
     (window,) = windows_of([Source(video_id="v", path=Path("v.mp4"))], length_s, seconds)
     kept = clips_of(length_s, window).clips
     assert kept and (len(kept) == 1 or kept[-1].end - kept[0].start <= 24 * seconds)
+
+
+@pytest.mark.parametrize(("frames", "left"), [(25, 25), (121, 121), (500, 121)])
+def test_the_warm_up_is_the_beginning_of_a_clip(frames: int, left: int) -> None:
+    source = Source(video_id="v", path=Path("v.mp4"))
+    found = clips_of(61.7, source)
+    (window,) = plan_windows([source], lambda _: found.cut_to(frames), clip_frames=left, seconds=0)
+    timeline = plan_timeline(np.arange(found.frames) / 24)
+    (kept,) = plan_clips(timeline, clip_frames=left, leave_out_s=window.leave_out_s).kept
+    assert len(kept) == left and kept.start in {clip.start for clip in found.clips}
 
 
 def test_videos_whose_middle_is_a_hole_are_measured_beside_it(
@@ -161,7 +203,7 @@ def test_a_camera_costs_no_more_than_the_frames_that_it_is_read_from() -> None:
     }  # fmt: skip
     measured = _Measured.of(receipts)
     assert (measured.camera_frames, measured.frames_per_clip) == (720, 48)
-    costs = _scaled(receipts, measured, {"v": 7200.0}, candidates={"v": 3600}, sampled=1800)
+    costs = _scaled(receipts, measured, {"v": 7200.0}, candidates={"v": 3600}, counted=3600, sampled=1800)
     seconds = {cost.stage: cost.core_hours * 3600 for cost in costs}
     assert seconds["ego"] == pytest.approx(10 * 1800 / 15)
     assert seconds["camera"] == pytest.approx(10 * ROAD_FRAMES / 720)

@@ -211,6 +211,8 @@ def alter(path: Path) -> None:
 @pytest.mark.parametrize(
     ("altered", "gone", "stage"),
     [
+        ("videos/day/index.parquet", "selection.parquet", "select"),
+        ("videos/day/counts.parquet", "selection.parquet", "select"),
         ("videos/day/index.parquet", "videos/day/run_*[0-9].mp4", "cut"),
         ("videos/day/run_*[0-9].mp4", "shards/*.tar", "pack"),
         ("shards/rows/*.parquet", "shards/index.parquet", "shards"),
@@ -235,6 +237,20 @@ def test_what_is_made_from_an_altered_file_fails_until_that_file_is_removed(
     damaged.unlink()
     run_all(make_job(root, videos, detector))
     assert tree(root) == tree(undisturbed.root)
+
+
+def test_an_altered_selection_is_not_extended(tmp_path: Path, videos: Path, detector: Path, undisturbed: Job) -> None:
+    """Its threshold and split would hold for the videos that come."""
+    root = tmp_path / "J"
+    shutil.copytree(undisturbed.root, root)
+    alter(root / "selection.parquet")
+    write_street(tmp_path / "more" / "dawn.mp4", frames=24, level=60, seed=9)
+    job = make_job(root, videos, detector)
+    job.sources |= {source.video_id: source for source in find_videos([tmp_path / "more"])}
+    job.selection_mode = "extend"
+    _, reports = run_all(job, stages=("source", "index", "count", "select"))
+    (receipt,) = reports[-1].failed
+    assert (receipt.reason, receipt.retryable) == ("altered", True) and "selection.parquet" in receipt.message
 
 
 @pytest.mark.parametrize("table", ["selection.parquet", "shards/index.parquet"])

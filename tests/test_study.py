@@ -3,7 +3,8 @@
 import json
 import math
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -14,7 +15,9 @@ from dataset.street_segments import SEGMENTS
 from labeling.boxes import iou
 from labeling.camera import Trajectory, rigid
 from labeling.errors import ConfigError, DataError
+from pipelines.study_data import StudyClip
 from pipelines.study_picture import BESIDES, FIGURES, draw_study, shared_reason
+from pipelines.study_shipped import _hits
 from training.criteria import MATCH_IOU
 from training.metrics import mean_interval
 from training.study_judge import PAIR_FRAMES, JudgeClip, chained, motion_of, pair_batch
@@ -50,6 +53,17 @@ def test_questions_ask_for_arms_that_exist_and_a_larger_budget_buys_more():
 def test_a_budget_that_is_no_time_is_refused(minutes):
     with pytest.raises(ConfigError, match=f"a budget of {minutes:g} minutes .*; give a number from 5 on"):
         plan_study(minutes)
+
+
+def test_one_found_box_is_one_car():
+    """Of two cars side by side, a box over both is one at most; a box for each is two, whatever else is found."""
+    cars = [SimpleNamespace(box_xyxy=np.array(box), visible_share=1.0) for box in ((0, 0, 60, 60), (20, 0, 80, 60))]
+    clip = cast(StudyClip, SimpleNamespace(cars=lambda: [cars]))
+    over_both, left, right = (10, 0, 70, 60), (0, 0, 50, 60), (30, 0, 80, 60)
+    assert sorted(_hits(clip, 0, np.array([over_both]))) == [0, 1]
+    assert _hits(clip, 0, np.array([over_both, right, left])) == [1, 1]
+    assert _hits(clip, 0, np.empty(0)) == [0, 0]
+    assert _hits(cast(StudyClip, SimpleNamespace(cars=lambda: [[]])), 0, np.array([left])) == []
 
 
 def test_shape_videos_are_functions_of_seed_and_index_and_move():

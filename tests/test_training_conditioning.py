@@ -19,7 +19,8 @@ from training.conditioning import (
     token_coordinates,
     unpack,
 )
-from training.flow import Convention, interpolate, sampling_sigmas
+from training.config import Convention
+from training.flow import interpolate, sampling_sigmas
 from training.latents import open_store
 from training.stages import stage_inputs
 

@@ -11,6 +11,8 @@ from safetensors import SafetensorError, safe_open
 
 from labeling.errors import ModelError
 
+ADAPTER = "adapter.safetensors"
+"""An adapter's file in its folder."""
 OUR_METADATA = "animatic"
 _SECTIONS = ("optimiser", "backbone", "conditions")
 """Of the settings, what is read again."""
@@ -31,7 +33,7 @@ class Progress:
 
 def adapter_file(path: Path) -> Path:
     """The file of an adapter that is named by its folder or by itself."""
-    return path / "adapter.safetensors" if path.is_dir() else path
+    return path / ADAPTER if path.is_dir() else path
 
 
 def read_about(path: Path) -> dict[str, Any]:

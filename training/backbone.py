@@ -14,8 +14,7 @@ import torch
 
 from labeling.errors import ConfigError
 from training.adapters import AdapterFile
-from training.config import AdapterConfig, BackboneConfig
-from training.flow import Convention
+from training.config import AdapterConfig, BackboneConfig, Convention
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

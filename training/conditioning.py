@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 
 from training.backbone import LatentGeometry, StageInputs
-from training.flow import Convention
+from training.config import Convention
 
 TIMESTEP_SCALE = 1000.0
 """The network's timestep at pure noise."""

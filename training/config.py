@@ -16,6 +16,10 @@ from labeling.settings_files import laid_over, parse_settings, read_yaml
 
 Stage = Literal["motion", "appearance", "end_to_end"]
 STAGES: tuple[Stage, ...] = ("motion", "appearance", "end_to_end")
+Convention = Literal["consistent", "released"]
+"""Of coordinates and of the shift of noise levels: as this project has them, or as the released code."""
+Formula = Literal["variance", "blend"]
+"""Of targeted noise; see ``training.targeted_noise``."""
 _LONGEST_NAME = 200
 """Bytes: file systems take 255, and the stage's name is added."""
 CONFIG_FOLDER = Path(__file__).with_name("configs")
@@ -170,7 +174,7 @@ class ConditionsConfig(_Settings):
     objects_probability: float = Field(default=0.5, ge=0, le=1)
     caption_dropout: float = Field(default=0.1, ge=0, le=1)
     """Share of samples that see the empty caption, since sampling uses guidance."""
-    coordinates: Literal["consistent", "released"] = "consistent"
+    coordinates: Convention = "consistent"
     """``released`` is for sampling with the released adapters only."""
 
 
@@ -179,7 +183,7 @@ class TargetedNoiseConfig(_Settings):
 
     omega_max: float = Field(default=0.3, ge=0, le=1)
     """omega ~ U(0, omega_max) per sample; 0 switches it off."""
-    formula: Literal["variance", "blend"] = "variance"
+    formula: Formula = "variance"
 
 
 _Momentum = Annotated[float, Field(ge=0, lt=1)]

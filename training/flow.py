@@ -5,14 +5,12 @@ Training draws sigma from a logit-normal (Esser et al. 2024, eq. 19) that is shi
 as LTX-Video does: 0.95 at 1,024 tokens, 2.05 at 4,096, *bounded* there; the released trainer extrapolates.
 """
 
-from typing import Literal
-
 import torch
+
+from training.config import Convention
 
 BASE_TOKENS, MAX_TOKENS = 1024, 4096
 BASE_SHIFT, MAX_SHIFT = 0.95, 2.05
-
-Convention = Literal["consistent", "released"]
 
 
 def shift_for_tokens(tokens: int, *, convention: Convention = "consistent") -> float:

@@ -21,8 +21,7 @@ from training.adapter_notes import adapter_file, read_about
 from training.backbone import Backbone, SamplingSettings
 from training.backbones import load_backbone
 from training.clip_generator import ClipConditions, ClipGenerator, GeneratedClip
-from training.config import BackboneConfig, backbone_config
-from training.flow import Convention
+from training.config import BackboneConfig, Convention, backbone_config
 from training.sampling_inputs import (
     LabelledFrame,
     control_clip,

@@ -13,9 +13,8 @@ from labeling.errors import ModelError
 from training.adapters import AdapterFile, attach_adapter, load_adapter
 from training.backbone import LatentGeometry, SamplingSettings, StageInputs, TextEmbedding, with_empty_text
 from training.conditioning import TokenSequence, assemble_tokens, pack, sequence_tokens, unpack
-from training.config import AdapterConfig, BackboneConfig
+from training.config import AdapterConfig, BackboneConfig, Convention
 from training.flow import (
-    Convention,
     interpolate,
     masked_mse,
     sampling_sigmas,

@@ -11,10 +11,11 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from labeling.errors import DataError
+from training.adapter_notes import ADAPTER
 from training.adapters import adapter_bytes, put_adapter, read_adapter
 from training.config import TrainConfig
 
-ADAPTER, OPTIMISER, STATE = "adapter.safetensors", "optimiser.safetensors", "state.json"
+OPTIMISER, STATE = "optimiser.safetensors", "state.json"
 FILES = (ADAPTER, OPTIMISER, STATE)
 """Of a checkpoint; the run goes on from no fewer."""
 _MOMENTS = ("exp_avg", "exp_avg_sq", "step")

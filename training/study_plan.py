@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from labeling.errors import ConfigError
-from training.backbone import LatentGeometry
 from training.config import PictureConfig, Stage
+from training.ltx import LTX_GEOMETRY
 from training.study_base import BasePlan
 
 QuestionName = Literal["decoupling", "noise", "control: segmentation", "control: boxes", "rate"]
@@ -19,7 +19,6 @@ DEFAULT_MINUTES = 360.0
 """Processor minutes: 3 h of 2 cores."""
 JUDGED_EVERY = 2
 """Native frames between judged ones: what the halved rate has too."""
-_GEOMETRY = LatentGeometry(channels=128, spatial=32, temporal=8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +61,7 @@ class StudyScale:
     def video_tokens(self, frame_step: int) -> int:
         """Latent cells of one video."""
         frames = (self.frames - 1) // frame_step + 1
-        _, groups, rows, columns = _GEOMETRY.latent_shape(frames=frames, height=self.height, width=self.width)
+        _, groups, rows, columns = LTX_GEOMETRY.latent_shape(frames=frames, height=self.height, width=self.width)
         return groups * rows * columns
 
 
@@ -85,7 +84,7 @@ class StageRun:
     def tokens(self, scale: StudyScale) -> int:
         """Of one sequence: the ego video and the first picture, or the control video, and the target."""
         video = scale.video_tokens(self.frame_step)
-        image = scale.width * scale.height // _GEOMETRY.spatial**2 if self.stage == "motion" else 0
+        image = scale.width * scale.height // LTX_GEOMETRY.spatial**2 if self.stage == "motion" else 0
         return 2 * video + image
 
     def steps(self, scale: StudyScale, tokens: int) -> int:

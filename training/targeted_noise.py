@@ -7,15 +7,12 @@ stage not to trust them to the pixel (MAD, arXiv 2601.09452). The reference's ti
 (1 - omega) z + omega eps. omega ~ U(0, omega_max), one per sample.
 """
 
-from typing import Literal
-
 import numpy as np
 import torch
 
 from labeling.errors import DataError
 from training.backbone import LatentGeometry
-
-Formula = Literal["variance", "blend"]
+from training.config import Formula
 
 
 def latent_mask(lit_THW: np.ndarray, *, geometry: LatentGeometry) -> np.ndarray:

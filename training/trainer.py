@@ -19,6 +19,7 @@ from torch.utils.data import DataLoader
 
 from dataset.receipts import atomic_write, storage_errors
 from labeling.errors import ConfigError, DataError
+from training.adapter_notes import ADAPTER
 from training.adapters import trainable_count
 from training.attachment import attach_for_training
 from training.backbone import Backbone
@@ -34,7 +35,7 @@ from training.latent_store import LatentStore
 from training.latents import check_store, manifest_picture, open_store
 from training.prefetch import Prefetched, leave_signals_to_the_trainer
 from training.run_log import METRICS, RunLog
-from training.run_state import ADAPTER, FILES, RunState, config_differences, pack_state, read_state, restore
+from training.run_state import FILES, RunState, config_differences, pack_state, read_state, restore
 from training.schedule import learning_rate
 from training.stages import reference_names, target_name
 from training.validation import held_out_losses, write_validation_videos
