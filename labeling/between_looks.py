@@ -10,8 +10,18 @@ from statistics import median
 
 import numpy as np
 
-from labeling.carrying import UNSEEN_FRAMES, along_path, box_diagonal, carry, close_gaps, interpolate_gaps
+from labeling.carrying import (
+    FINE,
+    UNSEEN_FRAMES,
+    FlowWindow,
+    along_path,
+    box_diagonal,
+    carry,
+    close_gaps,
+    interpolate_gaps,
+)
 from labeling.labels import Keypoints
+from labeling.medians import masked_median
 
 _BORDER_PX = 4.0
 """What is nearer to the picture's border is expected to leave it."""
@@ -25,6 +35,8 @@ class BetweenLooks:
 
     flow_step: int
     """Moments between two steps of flow; 0 for none."""
+    flow_window: FlowWindow = FINE
+    """What it compares."""
     shown_frames: int
     """How long something is shown that the next look, or the one before, does not know."""
     clocks: Sequence[int]
@@ -57,7 +69,8 @@ class BetweenLooks:
 
     def carry(self, grey: np.ndarray, *, frame: int) -> bool:
         """Carry all objects on; False when one inside the picture was lost for the first time."""
-        carried = carry(self._trail[-1][0], grey, [path[-1] for path in self._paths.values()], frame=frame)
+        labels = [path[-1] for path in self._paths.values()]
+        carried = carry(self._trail[-1][0], grey, labels, frame=frame, window=self.flow_window)
         self._trail.append((grey, frame))
         for path, moved in zip(self._paths.values(), carried, strict=True):
             path.append(moved.label)
@@ -105,11 +118,13 @@ class BetweenLooks:
                 arriving.setdefault(label.schema, []).append(label.track_id)
             else:
                 straight.setdefault(label.schema, []).append(label.track_id)
+        misses: list[float] = []
         for ids in arriving.values():
-            labels += close_gaps([self._paths[i] for i in ids], [now[i] for i in ids])
+            paths, ends = [self._paths[i] for i in ids], [now[i] for i in ids]
+            misses += _misses([path[-1] for path in paths], ends)
+            labels += close_gaps(paths, ends)
         for ids in straight.values():
             labels += interpolate_gaps([self._paths[i][0] for i in ids], [now[i] for i in ids])
-        misses = [_miss(self._paths[i][-1], now[i]) for ids in arriving.values() for i in ids]
         known = {label.track_id for label in self.seen}
         labels += self._came_from([label for label in seen if label.track_id not in known], frame)
         return self._inside(labels), median(misses) if misses else 0.0
@@ -145,7 +160,7 @@ class BetweenLooks:
         for (earlier, number), (later, _) in zip(self._trail[-2:0:-1], self._trail[:1:-1], strict=True):
             if self._apart(number, frame) > self.shown or not alive:
                 break
-            carried = carry(later, earlier, [path[0] for path in alive], frame=number)
+            carried = carry(later, earlier, [path[0] for path in alive], frame=number, window=self.flow_window)
             for path, moved in zip(alive, carried, strict=True):
                 if moved.followed:
                     path.insert(0, moved.label)
@@ -192,9 +207,9 @@ def _at_border(box_xyxy: np.ndarray, size: tuple[int, int]) -> bool:
     return bool((box_xyxy[:2] <= _BORDER_PX).any() or (box_xyxy[2:] >= np.subtract(size, _BORDER_PX)).any())
 
 
-def _miss(carried: Keypoints, seen: Keypoints) -> float:
-    both = carried.present & seen.present
-    if not both.any():
-        return 0.0
-    distance = np.linalg.norm(carried.points[both, :2] - seen.points[both, :2], axis=1)
-    return median(distance.tolist()) / box_diagonal(seen.box_xyxy)
+def _misses(carried: Sequence[Keypoints], seen: Sequence[Keypoints]) -> list[float]:
+    """How far the points of carried objects of one schema are from where they are seen: medians, in box diagonals."""
+    there, here = (np.array([label.points for label in labels]) for labels in (carried, seen))
+    both = (there[..., 2] > 0) & (here[..., 2] > 0)
+    medians = masked_median(np.linalg.norm(there[..., :2] - here[..., :2], axis=2), both)
+    return (medians / [box_diagonal(label.box_xyxy) for label in seen]).tolist()

@@ -60,11 +60,6 @@ class _Track:
     """(n, 5): frames since each sighting of the last ``_PAST_FRAMES``, then centre x, y, log width and height."""
     lost_frames: int
 
-    @property
-    def box_xyxy(self) -> np.ndarray:
-        centre, size = self.mean[:2, 0], np.exp(np.clip(self.mean[2:, 0], -3, 9))
-        return np.concatenate([centre - size / 2, centre + size / 2])
-
     def coast(self) -> None:
         """Let an object that went behind something go on as it went before."""
         known, state = motion.line(self.past)
@@ -146,7 +141,7 @@ class BoxTracker:
         """Match ``chosen`` boxes to tracks, update both; returns the boxes that found none."""
         if not tracks or not len(chosen):
             return chosen
-        predicted = np.stack([track.box_xyxy for track in tracks])
+        predicted = _boxes(np.stack([track.mean[:, 0] for track in tracks]))
         lost = np.array([track.lost_frames > frame_step for track in tracks])[:, None]
         settings = self.settings
         near, far = (
@@ -181,6 +176,12 @@ class BoxTracker:
             _Track(track_id=track_id, mean=mean, covariance=covariance, past=_sighting(box_xyxy), lost_frames=0)
         )
         return track_id
+
+
+def _boxes(places: np.ndarray) -> np.ndarray:
+    """(N, 4) left, top, right, bottom of (N, 4) centres and log sizes."""
+    centres, halves = places[:, :2], np.exp(np.clip(places[:, 2:], -3, 9)) / 2
+    return np.concatenate([centres - halves, centres + halves], axis=1)
 
 
 def _grown(boxes_xyxy: np.ndarray, buffer: float) -> np.ndarray:

@@ -15,8 +15,6 @@ import numpy as np
 from labeling.labels import POINT_ABSENT, POINT_CARRIED, POINT_INTERPOLATED, Keypoints
 from labeling.medians import masked_median
 
-_WINDOW = (11, 11)
-_LEVELS = 3
 _MAX_RETURN_PX = 0.7
 """Half-size pixels by which a point may miss its start after going there and back."""
 _MIN_FOLLOWED_SHARE = 0.4
@@ -39,6 +37,21 @@ _FEW, _MANY = (
 )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowWindow:
+    """What of a half-size picture Lucas-Kanade compares."""
+
+    side: int
+    """Pixels, odd."""
+    levels: int
+    """Halvings of the picture at which it begins."""
+
+
+FINE, COARSE = FlowWindow(side=11, levels=3), FlowWindow(side=9, levels=2)
+"""The coarse one takes two thirds of the time. Its single points are worse, which objects that are followed as a whole
+hardly notice."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Carried:
     """An object as far as flow could take it."""
@@ -55,7 +68,9 @@ def small_grey(frame: np.ndarray) -> np.ndarray:
     return cv2.resize(grey, (grey.shape[1] // 2, grey.shape[0] // 2), interpolation=cv2.INTER_AREA)
 
 
-def carry(previous: np.ndarray, current: np.ndarray, labels: Sequence[Keypoints], *, frame: int) -> list[Carried]:
+def carry(
+    previous: np.ndarray, current: np.ndarray, labels: Sequence[Keypoints], *, frame: int, window: FlowWindow = FINE
+) -> list[Carried]:
     """Objects moved from one frame into one of its next neighbours, before or after.
 
     Args:
@@ -63,6 +78,7 @@ def carry(previous: np.ndarray, current: np.ndarray, labels: Sequence[Keypoints]
         current: (h, w) uint8, the same of the frame to carry into.
         labels: objects with some present points, or a box alone (whose corners' inside is then followed).
         frame: grid number of the frame to carry into.
+        window: what is compared.
     """
     if not labels:
         return []
@@ -72,7 +88,7 @@ def carry(previous: np.ndarray, current: np.ndarray, labels: Sequence[Keypoints]
     start, end = np.zeros((*used.shape, 2), np.float32), np.zeros((*used.shape, 2), np.float32)
     good = np.zeros(used.shape, bool)
     start[used] = np.concatenate(starts)
-    end[used], good[used] = _follow(previous, current, start[used])
+    end[used], good[used] = _follow(previous, current, start[used], window)
     scales, shifts = _shared_motion(start, end, good)
     followed = (good.sum(axis=1) >= _MIN_CORNERS) & (good.sum(axis=1) >= _MIN_FOLLOWED_SHARE * counts)
     carried: dict[int, Keypoints] = {}
@@ -207,11 +223,15 @@ def _points_to_follow(label: Keypoints) -> np.ndarray:
     return np.concatenate([own, (left, top) + grid * (right - left, bottom - top)]).astype(np.float32)
 
 
-def _follow(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _follow(
+    previous: np.ndarray, current: np.ndarray, points: np.ndarray, window: FlowWindow
+) -> tuple[np.ndarray, np.ndarray]:
     """Where (N, 2) full-size points went, and (N,) bool: those that come back when followed backwards."""
     # Pixel centres lie on integers: full-size x is 2 x' + 0.5 for half-size x'.
     start = ((points - 0.5) / 2)[:, None]
-    options = {"winSize": _WINDOW, "maxLevel": _LEVELS, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    options = {
+        "winSize": (window.side, window.side), "maxLevel": window.levels, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW
+    }  # fmt: skip
     there, found, _ = cv2.calcOpticalFlowPyrLK(previous, current, start, start.copy(), **options)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(current, previous, there, start.copy(), **options)
     distance = np.linalg.norm((back - start)[:, 0], axis=1)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from labeling.carrying import box_diagonal
+from labeling.carrying import COARSE, FINE, FlowWindow, box_diagonal
 from labeling.labels import Keypoints
 
 Effort = Literal["fast", "balanced", "exact"]
@@ -29,6 +29,8 @@ class EffortSettings:
     """The same after something near came or went."""
     flow_step: int = 1
     """Frames between two steps of the optical flow that carries points; 0 for none: points go straight then."""
+    flow_window: FlowWindow = FINE
+    """What flow compares."""
     max_bend: float = 0.03
     """Share of its size by which an object's growth may depart from a straight line where no flow follows it."""
     max_miss: float = 0.05
@@ -51,6 +53,7 @@ EFFORTS: dict[Effort, EffortSettings] = {
         max_lane_gap=12,
         news_gap=8,
         flow_step=5,
+        flow_window=COARSE,
         max_bend=0.05,
         max_miss=0.12,
         sure_share=0.6,

@@ -204,8 +204,9 @@ class _Channel:
         flows = self.look.carries and self.settings.flow_step > 0
         self._rhythm = Rhythm(self.settings, flows=flows)
         self._between = BetweenLooks(
-            flow_step=self.settings.flow_step, shown_frames=self.settings.max_gap // 2, clocks=self._clocks
-        )
+            flow_step=self.settings.flow_step, flow_window=self.settings.flow_window,
+            shown_frames=self.settings.max_gap // 2, clocks=self._clocks,
+        )  # fmt: skip
         self._latest: tuple[_Views, int] | None = None
         self._looks: list[TrackedLook] = []
         self._labels: list[Keypoints] = []
