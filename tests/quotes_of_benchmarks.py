@@ -76,8 +76,8 @@ def models_of_two_cores(judged: Any) -> Iterator[Quote]:
 
 
 def models_cost(bench: Any) -> Iterator[Quote]:
-    yield readme(f", [{bench['total_ms']}] ms on an AMD EPYC with AVX-512;")
-    yield street_models(f"and [{bench['total_ms']}] ms in three runs in a row with AVX-512;")
+    yield readme(f"and [{bench['total_ms']}] ms on an Intel Xeon with AVX-512")
+    yield street_models(f"and [{bench['total_ms']}] ms in three runs in a row on an Intel Xeon")
 
 
 def counts_in_labels(bench: Any) -> Iterator[Quote]:
