@@ -549,6 +549,40 @@ def test_a_gap_is_crossed_on_straight_lines() -> None:
     assert interpolate_gaps([start], [replace(end, frame=6)]) == []
 
 
+def test_objects_closed_together_are_closed_as_each_by_itself() -> None:
+    """Points absent at one end or the other, lost by flow, followed well and missed by far; nodes and frames between."""
+    rng = np.random.default_rng(7)
+    shape = MovingCard(speed=0).label(0)
+
+    def drawn(track_id: int, frame: int) -> Keypoints:
+        label = replace(moved(shape, frame, float(rng.normal(0, 12))), track_id=track_id, score=float(rng.random()))
+        label.points[:, :2] += rng.normal(0, 4, (len(label.points), 2))
+        absent = rng.random(len(label.points)) < 0.3
+        label.points[absent] = 0
+        return replace(label, point_source=np.where(absent, 0, label.point_source).astype(np.int8))
+
+    paths = [[drawn(n, frame) for frame in (2, 5, 7, 13)] for n in range(6)]
+    ends = [drawn(n, 13) for n in range(6)]
+    together = close_gaps(paths, ends)
+    alone = [label for path, end in zip(paths, ends, strict=True) for label in close_gaps([path], [end])]
+    assert [(label.frame, label.track_id) for label in together] == [(f, n) for n in range(6) for f in range(3, 13)]
+    for one, other in zip(together, alone, strict=True):
+        assert one.score == other.score
+        np.testing.assert_array_equal(one.points, other.points)
+        np.testing.assert_array_equal(one.point_source, other.point_source)
+        np.testing.assert_array_equal(one.box_xyxy, other.box_xyxy)
+    starts = [path[0] for path in paths]
+    for one, other in zip(
+        interpolate_gaps(starts, ends),
+        [label for pair in zip(starts, ends, strict=True) for label in interpolate_gaps([pair[0]], [pair[1]])],
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one.points, other.points)
+        # An absent point has no place, and comes from nowhere.
+        assert not one.points[~one.present].any() and not one.point_source[~one.present].any()
+        assert one.point_source[one.present].all()
+
+
 def test_unknown_extractors_are_named() -> None:
     with pytest.raises(ConfigError, match="yolox_nano"):
         choose_extractors(["yolo_nano"])
