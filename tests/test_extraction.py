@@ -550,7 +550,7 @@ def test_a_gap_is_crossed_on_straight_lines() -> None:
 
 
 def test_objects_closed_together_are_closed_as_each_by_itself() -> None:
-    """Points absent at one end or the other, lost by flow, followed well and missed by far; nodes and frames between."""
+    """Points absent at one end or both, followed well and missed by far; nodes, and frames between them."""
     rng = np.random.default_rng(7)
     shape = MovingCard(speed=0).label(0)
 
