@@ -31,3 +31,8 @@ Cameras = Annotated[
 ]
 Wait = Annotated[float, typer.Option(help="Minutes to wait for other parts that make no progress.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def listed(text: str) -> tuple[str, ...]:
+    """The names of a list with commas, without the spaces and the empty ones that lists typed by hand have."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipelines.cli_options import MEASURE, STOPPED, TRAIN, Effort, Extractors, JobFolder, Models, Workers
+from pipelines.cli_options import MEASURE, STOPPED, TRAIN, Effort, Extractors, JobFolder, Models, Workers, listed
 
 commands = typer.Typer()
 
@@ -38,7 +38,7 @@ def cache(
     _tell_stale(job)
     run_cache(
         job, backbone=backbone, part=part, object_variants=object_variants, device=device, refresh=refresh,
-        controls=tuple(controls.split(",")) if controls else (),
+        controls=listed(controls or ""),
     )  # fmt: skip
 
 
@@ -111,7 +111,7 @@ def generate(
     options = GenerateOptions(
         backbone=backbone, skeleton_video=skeleton_video, objects=objects, samples=samples, seed=seed, steps=steps,
         guidance=guidance, coordinates=coordinates, frames=frames,
-        extractors=tuple(extractors.split(",")) if extractors else None, models_dir=models, device=device,
+        extractors=listed(extractors) if extractors else None, models_dir=models, device=device,
     )  # fmt: skip
     if clips is not None or true_skeletons or object_variant is not None:
         from pipelines.generate_clips import ClipsRequest, show_clips
@@ -162,7 +162,7 @@ def evaluate(
     options = EvaluateOptions(
         out=out, true_skeletons=true_skeletons, trajectories=trajectories, skeletons=skeletons,
         samples_per_clip=samples_per_clip, seconds=seconds, object_variant=object_variant, every=every,
-        extractors=tuple(extractors.split(",")) if extractors else None, models_dir=models, effort=effort,
+        extractors=listed(extractors) if extractors else None, models_dir=models, effort=effort,
         workers=(os.cpu_count() or 1) if workers is None else workers,
     )  # fmt: skip
     raise typer.Exit(show_evaluation(job, samples, options))

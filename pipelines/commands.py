@@ -17,6 +17,7 @@ from labeling.errors import ConfigError
 from labeling.extractors import ExtractorChoice, Extractors, choose_extractors
 from labeling.onnx_model import resolve_providers
 from labeling.settings_files import read_yaml
+from pipelines.cli_options import listed
 from pipelines.config import EFFORTS, Config, merged, parse_config, with_effort
 from pipelines.console import ConsoleReporter, counted, print_damaged, print_failures, print_twins
 from pipelines.damage import damaged_videos
@@ -217,7 +218,7 @@ def _option_changes(options: JobOptions) -> Iterator[tuple[str, dict[str, Any]]]
     if options.cameras is not None:
         yield f"--cameras {options.cameras}", {"cameras": read_cameras(options.cameras)}
     if options.extractors is not None:
-        names = [name.strip() for name in options.extractors.split(",") if name.strip()]
+        names = list(listed(options.extractors))
         yield f"--extractors {options.extractors}", {"keypoints": {"extractors": names}}
     if options.videos is not None:
         yield f"--videos {options.videos}", {"pack": {"videos": options.videos}}

@@ -17,6 +17,7 @@ from pipeline_fixtures import SMALL, write_detector, write_street
 from safetensors.numpy import save_file
 
 from pipelines.cli import main
+from pipelines.cli_options import listed
 from pipelines.next_training import next_training
 from training.adapter_notes import OUR_METADATA
 
@@ -489,3 +490,7 @@ def test_a_list_of_paths_with_ids(run, video, config, tmp_path):
     assert code == 0 and "note street is mine again, byte for byte: its clips are dropped (same_as)" in out
     summary = json.loads(run("inspect", tmp_path / "J", "--json")[1])
     assert (summary["videos"], summary["kept"], summary["dropped"]) == (2, 1, {"left_out": 1, "same_as": 2})
+
+
+def test_lists_with_commas_are_read_as_they_are_typed() -> None:
+    assert listed("street, mine ,") == ("street", "mine") and listed(" ,") == ()
