@@ -18,17 +18,14 @@ _UPPER_SHARE = 0.56
 """The lower part is road, which moves with the car rather than with the camera's turn."""
 _LEAST_RESPONSE = 0.45
 """Below it no shift stands out: the pictures have nothing far in common (noise alone reaches 0.4)."""
+_MAX_STEP = 4
+"""Moments after which two pictures of a camera that turns sharply have too little in common."""
 
 
 class TurnMeter:
-    """How the camera of a run turned, measured once for all who ask.
+    """How the camera of a run turned, measured once for all who ask."""
 
-    Args:
-        max_step: moments after which two pictures of a camera that turns sharply have too little in common.
-    """
-
-    def __init__(self, *, max_step: int = 4) -> None:
-        self.max_step = max_step
+    def __init__(self) -> None:
         self._latest: tuple[np.ndarray, int] | None = None
         self._steps: list[tuple[int, np.ndarray]] = []
         """Moments, and the homography from the one before to each."""
@@ -39,7 +36,7 @@ class TurnMeter:
 
     def due(self, moment: int) -> bool:
         """Whether the turn up to ``moment`` must be measured so as not to lose it."""
-        return self._latest is not None and moment - self._latest[1] >= self.max_step
+        return self._latest is not None and moment - self._latest[1] >= _MAX_STEP
 
     def reach(self, frame: np.ndarray, moment: int) -> None:
         """Measure the turn up to ``moment``, whose picture is (H, W, 3) uint8 RGB; the first time it begins there."""

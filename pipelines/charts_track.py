@@ -18,7 +18,7 @@ from labeling.efforts import EFFORTS, EffortSettings
 from labeling.extraction import label_with
 from labeling.labels import UNTRACKED, Keypoints
 from labeling.observation import Look, looks_of
-from labeling.picture_turn import picture_turn, turn_view
+from labeling.picture_turn import TurnMeter
 from labeling.schemas import Category
 from labeling.smoothing import smooth_tracks
 from labeling.tracking import RunTracker
@@ -152,13 +152,11 @@ def greedy_overlap(clip: TrackClip) -> list[Keypoints]:
 
 def tracked(clip: TrackClip, *, turns: bool = True, settings: TrackerSettings | None = None) -> list[Keypoints]:
     """Our tracker at every frame, with or without the camera's turn; raw points."""
-    tracker, view, found = RunTracker(settings, start_scores=clip.sure_scores), None, []
+    tracker, meter, found = RunTracker(settings, start_scores=clip.sure_scores), TurnMeter(), []
     for number, (frame, labels) in enumerate(zip(clip.clip.frames, clip.looks, strict=True)):
-        before, view = view, turn_view(frame) if turns else None
-        height, width = frame.shape[:2]
-        turn = (
-            picture_turn(before, view, width=width, height=height) if before is not None and view is not None else None
-        )
+        if turns:
+            meter.reach(frame, number)
+        turn = meter.since(number - 1) if turns else None
         named = tracker.update(labels, frame=number, previous_to_current=turn)
         found += [label for label in named if label.track_id != UNTRACKED]
     return found

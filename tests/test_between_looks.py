@@ -7,8 +7,10 @@ import pytest
 from moving_card import MovingCard
 
 from labeling.between_looks import BetweenLooks, cut_at_border
-from labeling.carrying import small_grey
+from labeling.carrying import COARSE, FINE, Carried, FlowWindow, carry, small_grey
+from labeling.efforts import Effort
 from labeling.errors import DataError
+from labeling.extraction import label_with
 from labeling.labels import Keypoints
 
 SCENE = MovingCard(speed=1.5)
@@ -109,3 +111,18 @@ def test_labels_made_together_are_checked_together(wrong: str) -> None:
         points[1, 3, 0] = np.nan
     with pytest.raises(DataError):
         label.elsewhere([4, 5, 6], boxes_xyxy=boxes, points=points, point_source=sources, scores=scores)
+
+
+def test_flow_compares_what_the_effort_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    windows: list[FlowWindow] = []
+
+    def noted(*pictures: np.ndarray, window: FlowWindow, **rest: int) -> list[Carried]:
+        windows.append(window)
+        return carry(*pictures, window=window, **rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("labeling.between_looks.carry", noted)
+    wanted: dict[Effort, FlowWindow] = {"balanced": FINE, "fast": COARSE}
+    for effort, window in wanted.items():
+        windows.clear()
+        label_with([SCENE], [SCENE.render(n) for n in range(16)], first_frame=0, effort=effort)
+        assert windows and set(windows) == {window}

@@ -556,6 +556,7 @@ def test_objects_closed_together_are_closed_as_each_by_itself() -> None:
 
     def drawn(track_id: int, frame: int) -> Keypoints:
         label = replace(moved(shape, frame, float(rng.normal(0, 12))), track_id=track_id, score=float(rng.random()))
+        label.box_xyxy[2:] += 40 * track_id  # what is a far miss goes by the object's size
         label.points[:, :2] += rng.normal(0, 4, (len(label.points), 2))
         absent = rng.random(len(label.points)) < 0.3
         label.points[absent] = 0

@@ -74,7 +74,7 @@ def test_a_moment_is_measured_once_and_nothing_is_due_that_nobody_began(monkeypa
         return picture_turn(before, after, **size)
 
     monkeypatch.setattr(module, "picture_turn", counted)
-    meter = TurnMeter(max_step=4)
+    meter = TurnMeter()
     assert not meter.due(9)
     meter.reach(frame, 9)
     assert not meter.due(12) and meter.due(13) and calls == []
@@ -83,3 +83,15 @@ def test_a_moment_is_measured_once_and_nothing_is_due_that_nobody_began(monkeypa
     assert len(calls) == 1 and not meter.due(16)
     meter.forget()
     assert not meter.due(99) and np.array_equal(meter.since(9), np.eye(3))
+
+
+def test_turns_follow_one_another_in_the_order_of_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    steps = [np.random.default_rng(n).normal(size=(3, 3)) for n in range(3)]
+    left = iter(steps)
+    monkeypatch.setattr(module, "picture_turn", lambda *_, **__: next(left))
+    meter = TurnMeter()
+    for moment in range(4):
+        meter.reach(frame, moment)
+    np.testing.assert_allclose(meter.since(0), steps[2] @ steps[1] @ steps[0])
+    np.testing.assert_allclose(meter.since(1), steps[2] @ steps[1])
