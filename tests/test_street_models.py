@@ -235,9 +235,10 @@ def test_a_short_training_lowers_the_loss_and_repeats_with_its_seed(toy_pool: St
         assert torch.equal(one, other)
 
 
-def test_a_training_that_stopped_goes_on_to_the_same_weights(toy_pool: StreetPool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("optimiser", ["adamw", "muon"])
+def test_a_training_that_stopped_goes_on_to_the_same_weights(optimiser, toy_pool: StreetPool, tmp_path: Path) -> None:
     batches = FieldBatches(pool=toy_pool, schemas=("lane24",), size=(257, 193), count=1, augment=AugmentSettings())
-    settings = FitSettings(seed=3, steps=6, report_every=2)
+    settings = FitSettings(seed=3, steps=6, report_every=2, optimiser=optimiser)
 
     def stopping(rng: np.random.Generator) -> Batch:
         if rng.bit_generator.state == np.random.default_rng((3, 4)).bit_generator.state:
@@ -493,7 +494,8 @@ def test_a_second_lesson_goes_on_where_the_first_ended(
     assert "7 frames" not in capsys.readouterr().out
 
 
-def test_parts_of_a_network_learn_at_rates_of_their_own() -> None:
+@pytest.mark.parametrize("optimiser", ["adamw", "muon"])
+def test_parts_of_a_network_learn_at_rates_of_their_own(optimiser) -> None:
     network = torch.nn.ModuleDict({"slow": torch.nn.Linear(1, 1), "rest": torch.nn.Linear(1, 1)})
     before = {name: value.clone() for name, value in network.state_dict().items()}
 
@@ -501,8 +503,9 @@ def test_parts_of_a_network_learn_at_rates_of_their_own() -> None:
         return (network["slow"](batch) + network["rest"](batch)).square().sum()  # type: ignore[index]
 
     settings = FitSettings(
-        seed=0, steps=3, rates={"slow.": 0.0}, channels_last=False, average_decay=0.0, precision=torch.float32
-    )
+        seed=0, steps=3, rates={"slow.": 0.0}, channels_last=False, average_decay=0.0, precision=torch.float32,
+        optimiser=optimiser,
+    )  # fmt: skip
     after = fit(network, lambda rng: torch.ones(1, 1), loss, settings).state_dict()
     assert {name for name, value in before.items() if torch.equal(value, after[name])} == {"slow.weight", "slow.bias"}
 

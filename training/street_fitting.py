@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from labeling.errors import ModelError
+from training.muon import Muon
 
 LossFunction = Callable[[nn.Module, Any], torch.Tensor]
 BatchMaker = Callable[[np.random.Generator], Any]
@@ -28,8 +29,12 @@ class FitSettings:
 
     seed: int
     steps: int
+    optimiser: Literal["adamw", "muon"] = "adamw"
+    """Of weights with two axes and more; norms and biases are AdamW's in any case."""
+    elementwise: tuple[str, ...] = ()
+    """Starts of the names of weights that are AdamW's, too: of last layers whose outputs are rare or of many kinds."""
     learning_rate: float = 2e-3
-    """Peak of AdamW's rate; it warms up over the first twentieth and falls to nothing along a cosine."""
+    """Peak of the rate; it warms up over the first twentieth and falls to nothing along a cosine."""
     weight_decay: float = 0.01
     rates: dict[str, float] = field(default_factory=dict)
     """Share of the rate for parts of the network, by the start of their names; 1 for all others."""
@@ -78,29 +83,26 @@ def fit(
     if settings.channels_last:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network)
-    rated = _rated(network, settings.rates)
-    optimiser = torch.optim.AdamW(
-        [{"params": parameters} for parameters in rated.values()], lr=settings.learning_rate,
-        weight_decay=settings.weight_decay, betas=(0.9, 0.99),
-    )  # fmt: skip
+    optimisers = _optimisers(network, settings)
     if settings.fixed_norms:
         for module in network.modules():
             if isinstance(module, nn.BatchNorm2d):
                 module.eval()
-    state = _State(network=network, average=average, optimiser=optimiser, settings=settings)
+    state = _State(network=network, average=average, optimisers=optimisers, settings=settings)
     first = state.load(checkpoint, settings.device) if checkpoint and checkpoint.is_file() else 0
     device = torch.device(settings.device)
     precision = settings.precision or best_precision(device)
     recent: list[torch.Tensor] = []
     for step, batch in enumerate(_prefetched(make_batch, settings, first=first), first):
-        for share, group in zip(rated, optimiser.param_groups, strict=True):
-            group["lr"] = settings.learning_rate * share * rate_at(step, settings.steps)
+        for group in (group for one in optimisers for group in one.param_groups):
+            group["lr"] = group["peak"] * rate_at(step, settings.steps)
         with torch.autocast(device.type, precision, enabled=precision != torch.float32):
             loss = loss_of(network, batch if device.type == "cpu" else batch.to(device))
-        optimiser.zero_grad(set_to_none=True)
+        network.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 10.0)
-        optimiser.step()
+        for optimiser in optimisers:
+            optimiser.step()
         _update_average(average, network, min(settings.average_decay, (step + 1) / (step + 10)))
         # Read at reports alone: to read is to wait for the device.
         recent.append(loss.detach())
@@ -116,13 +118,21 @@ def fit(
     return average
 
 
-def _rated(network: nn.Module, rates: dict[str, float]) -> dict[float, list[nn.Parameter]]:
-    """Parameters by their share of the rate."""
-    groups: dict[float, list[nn.Parameter]] = {}
+def _optimisers(network: nn.Module, settings: FitSettings) -> tuple[torch.optim.Optimizer, ...]:
+    """Those that have something to do; each of their groups knows the ``peak`` of its rate."""
+    groups: dict[tuple[bool, float], list[nn.Parameter]] = {}
     for name, parameter in network.named_parameters():
-        share = next((share for start, share in rates.items() if name.startswith(start)), 1.0)
-        groups.setdefault(share, []).append(parameter)
-    return groups
+        share = next((share for start, share in settings.rates.items() if name.startswith(start)), 1.0)
+        matrix = settings.optimiser == "muon" and parameter.ndim >= 2 and not name.startswith(settings.elementwise)
+        groups.setdefault((matrix, settings.learning_rate * share), []).append(parameter)
+    mine, others = (
+        [{"params": group, "peak": peak} for (matrix, peak), group in groups.items() if matrix == wanted]
+        for wanted in (True, False)
+    )
+    rate, decay = settings.learning_rate, settings.weight_decay
+    muon = [Muon(mine, lr=rate, weight_decay=decay)] if mine else []
+    adamw = [torch.optim.AdamW(others, lr=rate, weight_decay=decay, betas=(0.9, 0.99))] if others else []
+    return (*muon, *adamw)
 
 
 def best_precision(device: torch.device) -> torch.dtype:
@@ -186,12 +196,14 @@ class _State:
 
     network: nn.Module
     average: nn.Module
-    optimiser: torch.optim.Optimizer
+    optimisers: tuple[torch.optim.Optimizer, ...]
     settings: FitSettings
 
     def save(self, path: Path, steps: int) -> None:
-        parts = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
-        _save({"steps": steps, **self._run()} | {name: part.state_dict() for name, part in parts.items()}, path)
+        parts = {"network": self.network, "average": self.average}
+        states = {name: part.state_dict() for name, part in parts.items()}
+        optimisers = [one.state_dict() for one in self.optimisers]
+        _save({"steps": steps, **self._run(), **states, "optimisers": optimisers}, path)
 
     def _run(self) -> dict[str, int]:
         """What batches and rates depend on: a state of another run is not gone on from."""
@@ -211,7 +223,8 @@ class _State:
             )
         self.network.load_state_dict(kept["network"])
         self.average.load_state_dict(kept["average"])
-        self.optimiser.load_state_dict(kept["optimiser"])
+        for optimiser, state in zip(self.optimisers, kept["optimisers"], strict=True):
+            optimiser.load_state_dict(state)
         return int(kept["steps"])
 
 
