@@ -527,6 +527,15 @@ def test_every_device_has_a_budget_for_every_model(device) -> None:
 
 
 @pytest.mark.parametrize("name", MODEL_NAMES)
+def test_settings_of_parts_name_parts_that_a_network_has(name) -> None:
+    plan = recipe(name)
+    parameters = [parameter for parameter, _ in plan.network().named_parameters()]
+    for settings in (lesson.fit for lesson in plan.lessons):
+        for start in (*settings.elementwise, *settings.rates):
+            assert any(parameter.startswith(start) for parameter in parameters), start
+
+
+@pytest.mark.parametrize("name", MODEL_NAMES)
 def test_recipes_build_what_their_cards_say(name) -> None:
     plan = recipe(name)
     pictures = torch.zeros(1, 3, plan.card.input_height, plan.card.input_width)

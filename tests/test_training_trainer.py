@@ -23,6 +23,7 @@ from training.latents import open_store
 from training.run_log import RunLog, read_metrics
 from training.run_state import RunState, config_differences, read_state
 from training.trainer import Trainer, TrainSummary, train
+from training.validation import HELD_OUT
 
 
 def run(config: TrainConfig, data: Path, out: Path, **settings: Any) -> TrainSummary:
@@ -114,6 +115,32 @@ def test_kill_9_and_resume_equals_an_undisturbed_run_bit_for_bit(
     assert (whole / "adapter.safetensors").read_bytes() == (broken / "adapter.safetensors").read_bytes()
     steps = [line["step"] for line in read_metrics(broken)]
     assert steps == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("steps", [3, 6], ids=["last", "not last"])
+def test_a_held_out_loss_that_a_kill_prevented_is_told_by_the_next_try(
+    steps: int, tiny_job: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch  # noqa: F811
+) -> None:  # fmt: skip
+    config = tiny_config(
+        "motion", optimiser={"steps": steps}, checkpoint={"every_steps": 3}, validation={"loss_every_steps": 3}
+    )
+    whole = run(config, tiny_job, tmp_path / "whole")
+
+    def killed(*_: object, **__: object) -> dict[str, float]:
+        raise RuntimeError("killed")
+
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="killed"):
+        patch.setattr("training.trainer.held_out_losses", killed)
+        run(config, tiny_job, tmp_path / "broken")
+    assert run(config, tiny_job, tmp_path / "broken").held_out == whole.held_out
+    curves = [
+        [(line["step"], line[HELD_OUT]) for line in read_metrics(tmp_path / name) if HELD_OUT in line]
+        for name in ("whole", "broken")
+    ]
+    assert curves[0] == curves[1] and len(curves[0]) == steps // 3
+    # What is there is not told again.
+    run(config, tiny_job, tmp_path / "broken")
+    assert sum(HELD_OUT in line for line in read_metrics(tmp_path / "broken")) == steps // 3
 
 
 def test_1_2_and_4_processes_have_the_same_losses(tiny_job: Path, tmp_path: Path) -> None:  # noqa: F811

@@ -50,12 +50,14 @@ class RunLog:
             TimeRemainingColumn(), TextColumn("{task.fields[memory]}"),
             console=Console(stderr=True), disable=quiet or not self._main, refresh_per_second=1,
         )  # fmt: skip
+        self._told_at_start: set[str] = set()
         self._task = self._progress.add_task("train", total=steps, completed=start, loss="-", rate="", memory="")
         if self._main:
             make_folder(out)
             with storage_errors(self._path):
-                kept = [line for line, values in _whole_lines(self._path) if values["step"] <= start]
-                atomic_write(self._path, "".join(f"{line}\n" for line in kept).encode())
+                kept = [(line, values) for line, values in _whole_lines(self._path) if values["step"] <= start]
+                atomic_write(self._path, "".join(f"{line}\n" for line, _ in kept).encode())
+            self._told_at_start.update(name for _, values in kept if values["step"] == start for name in values)
 
     def __enter__(self) -> "RunLog":
         self._progress.start()
@@ -63,6 +65,11 @@ class RunLog:
 
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
+
+    def lacks_at_start(self, name: str) -> bool:
+        """Whether an earlier try told no such number of the step that this one begins at; the same on all processes."""
+        lacks = torch.tensor(float(self._main and name not in self._told_at_start), device=self._accelerator.device)
+        return float(self._accelerator.reduce(lacks, "sum")) > 0  # type: ignore[arg-type]
 
     def step(self, step: int, values: dict[str, float]) -> None:
         """After optimiser step ``step`` (from 1)."""

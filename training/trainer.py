@@ -38,7 +38,7 @@ from training.run_log import METRICS, RunLog
 from training.run_state import FILES, RunState, config_differences, pack_state, read_state, restore
 from training.schedule import learning_rate
 from training.stages import reference_names, target_name
-from training.validation import held_out_losses, write_validation_videos
+from training.validation import HELD_OUT, held_out_losses, write_validation_videos
 
 Resume = Literal["auto", "never"] | Path
 _BUCKET = 2**24
@@ -215,6 +215,9 @@ class Trainer:
         self.micro_batches = Prefetched(self.loader)
         with stop_flag() as flag, log, memory_advice(config), self.micro_batches:
             stopping = False
+            # What was killed between a checkpoint and its held-out loss owes it.
+            if start and self._owes_validation(start, last=start == config.optimiser.steps):
+                held_out = self._validate(log) if log.lacks_at_start(HELD_OUT) else {}
             while self.step < config.optimiser.steps and not stopping:
                 values, stopping = self._one_step(flag)
                 losses.append(values["loss"])
@@ -223,7 +226,7 @@ class Trainer:
                 last = self.step == config.optimiser.steps or stopping
                 if last or self.step % config.checkpoint.every_steps == 0:
                     self._save()
-                if _due(self.step, config.validation.loss_every_steps, last=last and not stopping):
+                if self._owes_validation(self.step, last=last and not stopping):
                     held_out = self._validate(log)
                 if _due(self.step, config.validation.videos_every_steps, last=False):
                     self._videos()
@@ -309,6 +312,9 @@ class Trainer:
         if values:
             log.write(self.step, values)
         return values
+
+    def _owes_validation(self, step: int, *, last: bool) -> bool:
+        return _due(step, self.config.validation.loss_every_steps, last=last)
 
     def _videos(self) -> None:
         if self.accelerator.is_main_process:

@@ -16,6 +16,8 @@ from training.config import TrainConfig, exact_rate
 from training.draws import keyed_normal
 from training.latent_store import LatentStore
 
+HELD_OUT = "held_out/mean"
+"""What the mean over all noise levels is called in a run's metrics."""
 _MOMENTS = 8
 
 
@@ -46,7 +48,7 @@ def held_out_losses(
                 )[0]  # fmt: skip
     means = [float(value) / len(keys) for value in accelerator.reduce(sums, "sum")]  # type: ignore[union-attr]
     named = {f"held_out/sigma_{share:.2f}": mean for share, mean in zip(config.validation.sigmas, means, strict=True)}
-    return named | {"held_out/mean": sum(means) / len(means)}
+    return named | {HELD_OUT: sum(means) / len(means)}
 
 
 class _Evaluating(AbstractContextManager):
