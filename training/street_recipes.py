@@ -40,7 +40,7 @@ _WINDOWS = ((416, 288, 6), (*PICTURE_SIZE, 2))
 """Of the detector: windows are full of objects, whole pictures show both ends of near cars. Small batches, many steps:
 of the same pictures twice as many find more people."""
 _RATE = 1e-2
-"""Peak of Muon's. Steps of orthogonal matrices learn in 1,000 what AdamW's learn in over 2,000."""
+"""Peak of Muon's, which learns more of as many steps than AdamW (``docs/street_models.md``)."""
 _ELEMENTWISE: dict[ModelName, tuple[str, ...]] = {
     "street_detector": ("first.head.",), "street_fields": ("cif.", "caf."), "street_car24": (), "street_coco17": (),
 }  # fmt: skip
@@ -109,8 +109,8 @@ BUDGETS: dict[Device, Budget] = {
         steps={"street_detector": 14000, "street_fields": 6000, "street_coco17": 9000, "street_car24": 4000},
     ),
 }  # fmt: skip
-"""Two cores in under an hour; one GPU with sixteen cores in under ten minutes, from which the shipped models come, but
-for the detector, which went on from there (``docs/street_models.md``)."""
+"""Two cores in about an hour; one GPU with sixteen cores in ten minutes. The shipped models come from a GPU, by AdamW and
+not by Muon, and the detector went on from there (``docs/street_models.md``)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
