@@ -4,6 +4,7 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -253,7 +254,8 @@ def test_a_training_that_stopped_goes_on_to_the_same_weights(optimiser, toy_pool
     with pytest.raises(KeyboardInterrupt):
         train(stopping, tmp_path / "state.pt")
     assert (tmp_path / "state.pt").is_file()
-    for other in (replace(settings, steps=8), replace(settings, seed=4)):
+    changed = {"adamw": "muon", "muon": "adamw"}[optimiser]
+    for other in (replace(settings, steps=8), replace(settings, seed=4), replace(settings, optimiser=changed)):
         with pytest.raises(ModelError, match="stopped in a training of 6 steps with seed 3"):
             train(batches, tmp_path / "state.pt", other)
     resumed, whole = train(batches, tmp_path / "state.pt"), train(batches, None)
@@ -508,6 +510,30 @@ def test_parts_of_a_network_learn_at_rates_of_their_own(optimiser) -> None:
     )  # fmt: skip
     after = fit(network, lambda rng: torch.ones(1, 1), loss, settings).state_dict()
     assert {name for name, value in before.items() if torch.equal(value, after[name])} == {"slow.weight", "slow.bias"}
+
+
+def test_elementwise_weights_are_adamws_and_all_others_muons() -> None:
+    batch = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
+
+    def fitted(**changes: Any) -> dict[str, torch.Tensor]:
+        torch.manual_seed(0)
+        network = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Linear(4, 2))
+        settings = FitSettings(seed=0, steps=1, channels_last=False, precision=torch.float32, average_decay=0.0)
+        return fit(
+            network, lambda rng: batch, lambda net, given: net(given).square().mean(), replace(settings, **changes)
+        ).state_dict()
+
+    adamw, both = fitted(), fitted(optimiser="muon", elementwise=("1.",))
+    assert {name for name in adamw if not torch.equal(adamw[name], both[name])} == {"0.weight"}
+
+
+def test_a_state_of_an_older_version_is_refused(tmp_path: Path) -> None:
+    torch.save({"steps": 2, "network": {}, "average": {}, "optimiser": {}}, tmp_path / "state.pt")
+    with pytest.raises(ModelError, match="older version; remove it"):
+        fit(
+            torch.nn.Linear(3, 1), lambda rng: None, lambda net, given: torch.zeros(()),
+            FitSettings(seed=0, steps=4, channels_last=False), checkpoint=tmp_path / "state.pt",
+        )  # fmt: skip
 
 
 @pytest.mark.skipif(torch.cuda.device_count() > 0, reason="there is a GPU")

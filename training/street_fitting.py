@@ -205,21 +205,22 @@ class _State:
         optimisers = [one.state_dict() for one in self.optimisers]
         _save({"steps": steps, **self._run(), **states, "optimisers": optimisers}, path)
 
-    def _run(self) -> dict[str, int]:
+    def _run(self) -> dict[str, int | str]:
         """What batches and rates depend on: a state of another run is not gone on from."""
-        return {"seed": self.settings.seed, "of_steps": self.settings.steps}
+        return {"seed": self.settings.seed, "of_steps": self.settings.steps, "learnt_by": self.settings.optimiser}
 
     def load(self, path: Path, device: str) -> int:
         """Steps done."""
         kept = torch.load(path, weights_only=True, map_location=device)
         if "steps" not in kept:
             raise ModelError(f"{path}: finished after {kept['finished']} steps; remove it to train for another length")
-        # States of older versions do not tell.
-        other = {name: kept[name] for name, value in self._run().items() if kept.get(name, value) != value}
-        if other:
+        if "optimisers" not in kept:
+            raise ModelError(f"{path}: was left by an older version; remove it to start afresh")
+        if any(kept[name] != value for name, value in self._run().items()):
             raise ModelError(
-                f"{path}: stopped in a training of {kept['of_steps']} steps with seed {kept['seed']}, this one is of "
-                f"{self.settings.steps} with seed {self.settings.seed}; remove it to start afresh"
+                f"{path}: stopped in a training of {kept['of_steps']} steps with seed {kept['seed']} by "
+                f"{kept['learnt_by']}, this one is of {self.settings.steps} with seed {self.settings.seed} by "
+                f"{self.settings.optimiser}; remove it to start afresh"
             )
         self.network.load_state_dict(kept["network"])
         self.average.load_state_dict(kept["average"])

@@ -216,8 +216,9 @@ class Trainer:
         with stop_flag() as flag, log, memory_advice(config), self.micro_batches:
             stopping = False
             # What was killed between a checkpoint and its held-out loss owes it.
-            if start and self._owes_validation(start, last=start == config.optimiser.steps):
-                held_out = self._validate(log) if log.lacks_at_start(HELD_OUT) else {}
+            owed = _due(start, config.validation.loss_every_steps, last=start == config.optimiser.steps)
+            if start and owed and log.lacks_at_start(HELD_OUT):
+                held_out = self._validate(log)
             while self.step < config.optimiser.steps and not stopping:
                 values, stopping = self._one_step(flag)
                 losses.append(values["loss"])
@@ -226,7 +227,7 @@ class Trainer:
                 last = self.step == config.optimiser.steps or stopping
                 if last or self.step % config.checkpoint.every_steps == 0:
                     self._save()
-                if self._owes_validation(self.step, last=last and not stopping):
+                if _due(self.step, config.validation.loss_every_steps, last=last and not stopping):
                     held_out = self._validate(log)
                 if _due(self.step, config.validation.videos_every_steps, last=False):
                     self._videos()
@@ -312,9 +313,6 @@ class Trainer:
         if values:
             log.write(self.step, values)
         return values
-
-    def _owes_validation(self, step: int, *, last: bool) -> bool:
-        return _due(step, self.config.validation.loss_every_steps, last=last)
 
     def _videos(self) -> None:
         if self.accelerator.is_main_process:
