@@ -15,7 +15,7 @@ from labeling.model_cards import YoloxCard
 from labeling.schemas import Category
 from pipelines.model_variants import resized_detector
 from training.street_augment import AugmentSettings
-from training.street_batches import SecondLookBatches, to_input
+from training.street_batches import DetectorBatches, Windows, to_input
 from training.street_export import export_model
 from training.street_losses import MINOR, match_candidates, second_look_loss
 from training.street_networks import FirstLook
@@ -182,7 +182,8 @@ def test_batches_tell_which_objects_are_judged() -> None:
     picture[300:350, 300:310] = 255
     frame = PoolFrame(picture=picture, scale=PICTURE_SCALE, objects=objects)
     pool = StreetPool(frames=(frame,), crops={"car": (), "person": (), "lane": ()})
-    batches = SecondLookBatches(pool=pool, count=8, augment=AugmentSettings(), plain_share=1.0)
+    whole = Windows(width=PICTURE_SIZE[0], height=PICTURE_SIZE[1], count=8)
+    batches = DetectorBatches(pool=pool, windows=(whole,), augment=AugmentSettings(), plain_share=1.0)
     batch = batches(np.random.default_rng(0))
     *grids, boxes, classes, importance = batch.targets
     assert [tensor.shape[0] for tensor in batch.targets] == [8] * 6 and len(grids) == 3

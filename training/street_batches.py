@@ -75,35 +75,63 @@ def mirror_order(table: KeypointSchema) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Windows:
+    """Parts of frames that make a batch."""
+
+    width: int
+    """Of each, a multiple of 32, as is the height."""
+    height: int
+    count: int
+    """In a batch."""
+    share: float = 1.0
+    """Of batches, beside those of other windows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorBatches:
-    """Windows of frames with grid targets."""
+    """Windows of frames, some plain, most moved and disturbed, with grid targets and objects for both looks."""
 
     pool: StreetPool
-    sizes: tuple[tuple[int, int, int], ...]
-    """Width and height of a window, multiples of 32, and how many make a batch; each batch draws one of these."""
+    windows: tuple[Windows, ...]
+    """Each batch draws one of these."""
     augment: AugmentSettings
     scales: tuple[float, float] = (0.85, 1.2)
+    plain_share: float = 0.0
+    """Of windows as the camera took them."""
     person_share: float = 0.5
     """Of windows around a person: they are small and rare."""
 
     def __call__(self, rng: np.random.Generator) -> Batch:
-        """One batch: targets are classes (N, A), boxes (N, A, 4) and weights (N, A)."""
+        """One batch: targets are classes (N, A), boxes (N, A, 4) and weights (N, A) of the grid; then boxes (N, G, 4),
+        classes (N, G), -1 where there are fewer than G objects, and their importance (N, G), as ``second_look_loss``
+        takes them."""
+        shares = np.array([windows.share for windows in self.windows])
+        windows = self.windows[int(rng.choice(len(self.windows), p=shares / shares.sum()))]
+        size = (windows.width, windows.height)
         pictures: list[np.ndarray] = []
-        targets: list[GridTargets] = []
-        *size, count = self.sizes[int(rng.integers(len(self.sizes)))]
-        for _ in range(count):
+        grids: list[GridTargets] = []
+        objects: list[_Boxes] = []
+        for _ in range(windows.count):
             frame, people = _draw_frame(self.pool, rng, self.person_share)
             height, width = frame.picture.shape[:2]
+            plain = rng.random() < self.plain_share
             picture_to_window = random_map(
-                rng, source=(width, height), target=(size[0], size[1]), scales=self.scales, flip=rng.random() < 0.5,
-                focus_xy=self._focus(frame, rng, "person" if people else "car"),
+                rng, source=(width, height), target=size, scales=(1.0, 1.0) if plain else self.scales,
+                flip=rng.random() < 0.5, focus_xy=self._focus(frame, rng, "person" if people else "car"),
             )  # fmt: skip
             grey = (LETTERBOX_GREY,) * 3
             window = cv2.warpAffine(frame.picture, picture_to_window, size, borderValue=grey)
+            pictures.append(window if plain else disturb(window, rng, self.augment))
             found = _boxes_inside(frame, picture_to_window, size)
-            targets.append(encode_boxes(found.xyxy, found.classes, found.counted, width=size[0], height=size[1]))
-            pictures.append(disturb(window, rng, self.augment))
-        return Batch(pictures=_stack(pictures), targets=_stack_grids(targets))
+            objects.append(found)
+            grids.append(encode_boxes(found.xyxy, found.classes, found.counted, width=size[0], height=size[1]))
+        most = max(1, *(len(found.classes) for found in objects))
+        parts = (
+            [_padded(found.xyxy, most, 0) for found in objects],
+            [_padded(found.classes, most, -1) for found in objects],
+            [_padded(_importance(found), most, 0) for found in objects],
+        )
+        return Batch(pictures=_stack(pictures), targets=(*_stack_grids(grids), *map(_stack, parts)))
 
     def _focus(self, frame: PoolFrame, rng: np.random.Generator, category: Category) -> np.ndarray | None:
         """The middle of one object, picture pixels; one window in four lies anywhere."""
@@ -159,47 +187,6 @@ def _boxes_inside(frame: PoolFrame, picture_to_window: np.ndarray, size: Sequenc
         classes=np.array([CLASSES.index(truth.category) for truth in found], np.int64)[touching],
         shares=(left * np.array([truth.visible_share for truth in found], np.float64))[touching],
     )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SecondLookBatches:
-    """Whole pictures as the detector will see them, some plain, most moved and disturbed; grid targets and objects."""
-
-    pool: StreetPool
-    count: int
-    augment: AugmentSettings
-    scales: tuple[float, float] = (0.85, 1.2)
-    plain_share: float = 0.3
-    person_share: float = 0.4
-    """Of pictures with a person in them for sure."""
-
-    def __call__(self, rng: np.random.Generator) -> Batch:
-        """One batch: targets are those of ``DetectorBatches``, then boxes (N, G, 4), classes (N, G), -1 where there are
-        fewer than G objects, and their importance (N, G), as ``second_look_loss`` takes them."""
-        pictures, grids, objects = [], [], []
-        for _ in range(self.count):
-            frame, _ = _draw_frame(self.pool, rng, self.person_share)
-            height, width = frame.picture.shape[:2]
-            plain, flip = rng.random() < self.plain_share, bool(rng.random() < 0.5)
-            to_window = random_map(
-                rng, source=(width, height), target=(width, height), scales=(1.0, 1.0) if plain else self.scales,
-                flip=flip,
-            )  # fmt: skip
-            window = cv2.warpAffine(frame.picture, to_window, (width, height), borderValue=(LETTERBOX_GREY,) * 3)
-            pictures.append(window if plain else disturb(window, rng, self.augment))
-            objects.append(_boxes_inside(frame, to_window, (width, height)))
-            grids.append(
-                encode_boxes(
-                    objects[-1].xyxy, objects[-1].classes, objects[-1].counted, width=width, height=height
-                )
-            )  # fmt: skip
-        most = max(1, *(len(found.classes) for found in objects))
-        parts = (
-            [_padded(found.xyxy, most, 0) for found in objects],
-            [_padded(found.classes, most, -1) for found in objects],
-            [_padded(_importance(found), most, 0) for found in objects],
-        )
-        return Batch(pictures=_stack(pictures), targets=(*_stack_grids(grids), *map(_stack, parts)))
 
 
 def _importance(found: _Boxes) -> np.ndarray:

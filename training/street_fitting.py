@@ -96,6 +96,8 @@ def fit(
     for step, batch in enumerate(_prefetched(make_batch, settings, first=first), first):
         for group in (group for one in optimisers for group in one.param_groups):
             group["lr"] = group["peak"] * rate_at(step, settings.steps)
+        # What the network draws, as a dropout does, follows from the step as well: a pause changes nothing.
+        torch.manual_seed(int(np.random.default_rng((settings.seed, step, 1)).integers(2**63)))
         with torch.autocast(device.type, precision, enabled=precision != torch.float32):
             loss = loss_of(network, batch if device.type == "cpu" else batch.to(device))
         network.zero_grad(set_to_none=True)

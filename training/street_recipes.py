@@ -17,7 +17,7 @@ from training.street_batches import (
     CropBatches,
     DetectorBatches,
     FieldBatches,
-    SecondLookBatches,
+    Windows,
     to_input,
 )
 from training.street_fitting import FitSettings
@@ -36,17 +36,23 @@ from training.street_second_look import OBJECTS, TwoLookDetector, TwoLookGraph
 ModelName = Literal["street_detector", "street_car24", "street_coco17", "street_fields"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
 """In the order in which their training begins: the longest first, and the others beside it, one after the other."""
-_WINDOWS = ((416, 288, 6), (*PICTURE_SIZE, 2))
-"""Of the detector: windows are full of objects, whole pictures show both ends of near cars. Small batches, many steps:
-of the same pictures twice as many find more people."""
+_WIDTH, _HEIGHT = PICTURE_SIZE
+_WINDOWS = (Windows(width=416, height=288, count=6), Windows(width=_WIDTH, height=_HEIGHT, count=2))
+"""Of the detector's first lesson: windows are full of objects, whole pictures show both ends of near cars. Small
+batches, many steps: of the same pictures twice as many find more people."""
+_SECOND_WINDOWS = (
+    Windows(width=_WIDTH, height=_HEIGHT // 2, count=6, share=3.0), Windows(width=_WIDTH, height=_HEIGHT, count=3),
+)  # fmt: skip
+"""Of its second: pictures as labelling shows them, most without the sky and the road at the camera's feet, where there
+is little to learn."""
 _RATE = 1e-2
 """Peak of Muon's, which learns more of as many steps than AdamW (``docs/street_models.md``)."""
 _ELEMENTWISE: dict[ModelName, tuple[str, ...]] = {
     "street_detector": ("first.head.",), "street_fields": ("cif.", "caf."), "street_car24": (), "street_coco17": (),
 }  # fmt: skip
-_SECOND_COUNT, _SECOND_RATE, _SECOND_SHARE = 6, 2e-3, 3.0
-"""Whole pictures of a batch for the second look, the peak rate at which the first look goes on learning, and how many
-times faster the second learns."""
+_SECOND_RATE, _SECOND_SHARE = 2e-3, 3.0
+"""The peak rate at which the first look goes on learning in the second lesson, and how many times faster the second
+look does."""
 _SECOND_AUGMENT = AugmentSettings(night=0.15, weather=0.2)
 """What is taken for an object in bad weather or at night is for the second look to tell."""
 _MIDDLE_LEVELS, _CONTRAST = (128.0, 128.0, 128.0), (64.0, 64.0, 64.0)
@@ -83,10 +89,10 @@ class Budget:
     streets: int
     """To learn from."""
     other_streets: int
-    """For the detector's second look: those that its first look never saw, on which it is no better than elsewhere."""
+    """For the detector's second lesson: those that its first never saw, on which it is no better than elsewhere."""
     steps: dict[ModelName, int]
     second_steps: int
-    """Of the second look."""
+    """Of the detector's second lesson."""
     enlarge: int
     """Batches are so many times as large as those of a core."""
     loaders: dict[ModelName, int]
@@ -149,7 +155,7 @@ def recipe(name: ModelName, *, device: Device = "cpu", seed: int = 1, share: flo
     )  # fmt: skip
     if name == "street_detector":
         again = replace(
-            settings, name=f"{name}_second_look", steps=max(1, round(budget.second_steps * share)),
+            settings, name=f"{name}_second_lesson", steps=max(1, round(budget.second_steps * share)),
             learning_rate=_SECOND_RATE, rates={"second.": _SECOND_SHARE}, fixed_norms=True,
         )  # fmt: skip
         return _detector_recipe(settings, again, budget.enlarge)
@@ -159,24 +165,18 @@ def recipe(name: ModelName, *, device: Device = "cpu", seed: int = 1, share: flo
 
 
 def _detector_recipe(settings: FitSettings, again: FitSettings, enlarge: int) -> Recipe:
-    sizes = tuple((width, height, count * enlarge) for width, height, count in _WINDOWS)
+    first_windows, second_windows = (
+        tuple(replace(one, count=one.count * enlarge) for one in windows) for windows in (_WINDOWS, _SECOND_WINDOWS)
+    )
 
-    def cell_loss(rows: torch.Tensor, batch: Batch) -> torch.Tensor:
-        height, width = batch.pictures.shape[1:3]
-        cells, strides = (torch.from_numpy(array).to(rows.device) for array in grid_cells(width, height))
-        classes, boxes, weights = batch.targets[:3]
-        return detector_loss(rows.float(), classes, boxes, weights, cells, strides)
-
-    def first_loss(network: nn.Module, batch: Batch) -> torch.Tensor:
-        assert isinstance(network, TwoLookDetector)
-        return cell_loss(network.first(to_input(batch.pictures, card)), batch)
-
-    def both_losses(network: nn.Module, batch: Batch) -> torch.Tensor:
+    def loss(network: nn.Module, batch: Batch) -> torch.Tensor:
         first, second = network(to_input(batch.pictures, card))
-        judged = second_look_loss(
-            second, *batch.targets[3:], size=PICTURE_SIZE, low_px=JUDGED_HEIGHT_PX * PICTURE_SCALE
-        )
-        return cell_loss(first.rows, batch) + 0.5 * judged
+        height, width = batch.pictures.shape[1:3]
+        cells, strides = (torch.from_numpy(array).to(first.rows.device) for array in grid_cells(width, height))
+        classes, boxes, weights, *objects = batch.targets
+        claimed = detector_loss(first.rows, classes, boxes, weights, cells, strides)
+        judged = second_look_loss(second, *objects, size=(width, height), low_px=JUDGED_HEIGHT_PX * PICTURE_SCALE)
+        return claimed + 0.5 * judged
 
     card = YoloxCard(
         name=settings.name, file=f"{settings.name}.onnx", licence=_LICENCE, source=_DETECTOR_SOURCE, classes=CLASSES,
@@ -186,12 +186,14 @@ def _detector_recipe(settings: FitSettings, again: FitSettings, enlarge: int) ->
         score_threshold=0.4, nms_threshold=1.0, max_detections=OBJECTS, decided_classes=CLASSES,
     )  # fmt: skip
     first = Lesson(
-        batches=lambda pool: DetectorBatches(pool=pool, sizes=sizes, augment=AugmentSettings()), fit=settings,
-        loss=first_loss,
+        batches=lambda pool: DetectorBatches(pool=pool, windows=first_windows, augment=AugmentSettings()),
+        fit=settings, loss=loss,
     )  # fmt: skip
     second = Lesson(
-        batches=lambda pool: SecondLookBatches(pool=pool, count=_SECOND_COUNT * enlarge, augment=_SECOND_AUGMENT),
-        fit=again, loss=both_losses, pool="others",
+        batches=lambda pool: DetectorBatches(
+            pool=pool, windows=second_windows, augment=_SECOND_AUGMENT, plain_share=0.3, person_share=0.4,
+        ),
+        fit=again, loss=loss, pool="others",
     )  # fmt: skip
     return Recipe(card=card, network=lambda: TwoLookDetector(len(CLASSES)), graph=TwoLookGraph, lessons=(first, second))
 
