@@ -83,6 +83,7 @@ def fit(
     if settings.channels_last:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network)
+    means, values = _averaged(average, network)
     optimisers = _optimisers(network, settings)
     if settings.fixed_norms:
         for module in network.modules():
@@ -105,7 +106,8 @@ def fit(
         nn.utils.clip_grad_norm_(network.parameters(), 10.0)
         for optimiser in optimisers:
             optimiser.step()
-        _update_average(average, network, min(settings.average_decay, (step + 1) / (step + 10)))
+        with torch.no_grad():
+            torch._foreach_lerp_(means, values, 1 - min(settings.average_decay, (step + 1) / (step + 10)))
         # Read at reports alone: to read is to wait for the device.
         recent.append(loss.detach())
         if (step + 1) % settings.report_every == 0:
@@ -133,7 +135,7 @@ def _optimisers(network: nn.Module, settings: FitSettings) -> tuple[torch.optim.
     )
     rate, decay = settings.learning_rate, settings.weight_decay
     muon = [Muon(mine, lr=rate, weight_decay=decay)] if mine else []
-    adamw = [torch.optim.AdamW(others, lr=rate, weight_decay=decay, betas=(0.9, 0.99))] if others else []
+    adamw = [torch.optim.AdamW(others, lr=rate, weight_decay=decay, betas=(0.9, 0.99), fused=True)] if others else []
     return (*muon, *adamw)
 
 
@@ -237,8 +239,8 @@ def _save(content: dict[str, Any], path: Path) -> None:
     scratch.replace(path)
 
 
-@torch.no_grad()
-def _update_average(average: nn.Module, network: nn.Module, decay: float) -> None:
+def _averaged(average: nn.Module, network: nn.Module) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Tensors that follow, and those that they follow: all but whole numbers, such as a norm's count of batches."""
     pairs = zip(average.state_dict().values(), network.state_dict().values(), strict=True)
-    means, values = zip(*[pair for pair in pairs if pair[0].dtype.is_floating_point], strict=True)
-    torch._foreach_lerp_(means, values, 1 - decay)
+    followed = [pair for pair in pairs if pair[0].dtype.is_floating_point]
+    return [mean for mean, _ in followed], [value for _, value in followed]
