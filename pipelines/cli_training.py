@@ -117,7 +117,7 @@ def generate(
         from pipelines.generate_clips import ClipsRequest, show_clips
 
         request = ClipsRequest(
-            clips=clips or clip or "val",
+            clips=clips if clips is not None else clip or "val",
             ego=ego,
             caption=caption,
             true_skeletons=true_skeletons,
