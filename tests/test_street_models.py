@@ -502,22 +502,6 @@ def test_a_second_lesson_goes_on_where_the_first_ended(
     assert "7 frames" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("optimiser", ["adamw", "muon"])
-def test_parts_of_a_network_learn_at_rates_of_their_own(optimiser) -> None:
-    network = torch.nn.ModuleDict({"slow": torch.nn.Linear(1, 1), "rest": torch.nn.Linear(1, 1)})
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-
-    def loss(network: torch.nn.Module, batch: torch.Tensor) -> torch.Tensor:
-        return (network["slow"](batch) + network["rest"](batch)).square().sum()  # type: ignore[index]
-
-    settings = FitSettings(
-        seed=0, steps=3, rates={"slow.": 0.0}, channels_last=False, average_decay=0.0, precision=torch.float32,
-        optimiser=optimiser,
-    )  # fmt: skip
-    after = fit(network, lambda rng: torch.ones(1, 1), loss, settings).state_dict()
-    assert {name for name, value in before.items() if torch.equal(value, after[name])} == {"slow.weight", "slow.bias"}
-
-
 def test_elementwise_weights_are_adamws_and_all_others_muons() -> None:
     batch = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
 
@@ -563,7 +547,7 @@ def test_settings_of_parts_name_parts_that_a_network_has(name) -> None:
     plan = recipe(name)
     parameters = [parameter for parameter, _ in plan.network().named_parameters()]
     for settings in (lesson.fit for lesson in plan.lessons):
-        for start in (*settings.elementwise, *settings.rates):
+        for start in settings.elementwise:
             assert any(parameter.startswith(start) for parameter in parameters), start
 
 

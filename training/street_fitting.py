@@ -5,7 +5,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,8 +36,6 @@ class FitSettings:
     learning_rate: float = 2e-3
     """Peak of the rate; it warms up over the first twentieth and falls to nothing along a cosine."""
     weight_decay: float = 0.01
-    rates: dict[str, float] = field(default_factory=dict)
-    """Share of the rate for parts of the network, by the start of their names; 1 for all others."""
     fixed_norms: bool = False
     """Norm by what was learnt before, not by the batch: for a network that is trained already and goes on."""
     average_decay: float = 0.998
@@ -96,7 +94,7 @@ def fit(
     recent: list[torch.Tensor] = []
     for step, batch in enumerate(_prefetched(make_batch, settings, first=first), first):
         for group in (group for one in optimisers for group in one.param_groups):
-            group["lr"] = group["peak"] * rate_at(step, settings.steps)
+            group["lr"] = settings.learning_rate * rate_at(step, settings.steps)
         # What the network draws, as a dropout does, follows from the step as well: a pause changes nothing.
         torch.manual_seed(int(np.random.default_rng((settings.seed, step, 1)).integers(2**63)))
         with torch.autocast(device.type, precision, enabled=precision != torch.float32):
@@ -123,18 +121,14 @@ def fit(
 
 
 def _optimisers(network: nn.Module, settings: FitSettings) -> tuple[torch.optim.Optimizer, ...]:
-    """Those that have something to do; each of their groups knows the ``peak`` of its rate."""
-    groups: dict[tuple[bool, float], list[nn.Parameter]] = {}
+    """Those that have something to do."""
+    matrices: list[nn.Parameter] = []
+    others: list[nn.Parameter] = []
     for name, parameter in network.named_parameters():
-        share = next((share for start, share in settings.rates.items() if name.startswith(start)), 1.0)
-        matrix = settings.optimiser == "muon" and parameter.ndim >= 2 and not name.startswith(settings.elementwise)
-        groups.setdefault((matrix, settings.learning_rate * share), []).append(parameter)
-    mine, others = (
-        [{"params": group, "peak": peak} for (matrix, peak), group in groups.items() if matrix == wanted]
-        for wanted in (True, False)
-    )
+        is_matrix = settings.optimiser == "muon" and parameter.ndim >= 2 and not name.startswith(settings.elementwise)
+        (matrices if is_matrix else others).append(parameter)
     rate, decay = settings.learning_rate, settings.weight_decay
-    muon = [Muon(mine, lr=rate, weight_decay=decay)] if mine else []
+    muon = [Muon(matrices, lr=rate, weight_decay=decay)] if matrices else []
     adamw = [torch.optim.AdamW(others, lr=rate, weight_decay=decay, betas=(0.9, 0.99), fused=True)] if others else []
     return (*muon, *adamw)
 
