@@ -115,3 +115,11 @@ def test_choices_of_generate_are_those_of_the_sampler():
     """The command line spells them out, since it loads no settings before a command is called."""
     coordinates = get_type_hints(generate)["coordinates"]
     assert get_args(coordinates) == get_args(Convention)
+
+
+@pytest.mark.parametrize(("words", "clips"), [(["--clips", ""], ""), (["--true-skeletons"], "val")])
+def test_clips_of_no_name_are_not_those_of_no_option(words, clips, run, monkeypatch):
+    asked = []
+    monkeypatch.setattr("pipelines.generate_clips.show_clips", lambda job, request, **given: asked.append(request))
+    code, _, _ = run("generate", "--data", "job", "--out", "out", "--appearance", "adapter", *words)
+    assert code == 0 and [request.clips for request in asked] == [clips]

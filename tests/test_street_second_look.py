@@ -199,6 +199,11 @@ def test_batches_tell_which_objects_are_judged() -> None:
         # The white thing in the picture goes where its box would go.
         left = int(np.flatnonzero(shown[310, :, 0])[0])
         assert left == (width - 310 if flipped else 300)
+    # Of two kinds of windows each is drawn as often as its share says; what lies outside is not there.
+    sky = Windows(width=PICTURE_SIZE[0], height=64, count=2, share=3.0)
+    drawn = [replace(batches, windows=(whole, sky))(np.random.default_rng(seed)) for seed in range(40)]
+    assert 20 < sum(len(one.pictures) == 2 for one in drawn) < 40
+    assert all((one.targets[3][..., 3] <= 64).all() for one in drawn if len(one.pictures) == 2)
     # A moved and disturbed picture has its boxes inside.
     moved = replace(batches, plain_share=0.0)(np.random.default_rng(1))
     there = moved.targets[4] >= 0

@@ -122,7 +122,8 @@ def test_frames_of_one_street_count_as_one() -> None:
     assert grouped_standard_error(outcomes.tolist(), 1) < 0.5 * grouped_standard_error(outcomes.tolist(), 6)
 
 
-def test_sure_is_what_phantoms_in_bad_light_do_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("workers", [1, 3])
+def test_sure_is_what_phantoms_in_bad_light_do_not_reach(monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
     """A detector that is right in clear light and sees a second car, at 0.7, wherever light is bad."""
     there, ghost = car(0), car(400)
     picture = np.full((704, 1056, 3), 90, np.uint8)
@@ -140,6 +141,6 @@ def test_sure_is_what_phantoms_in_bad_light_do_not_reach(monkeypatch: pytest.Mon
         name="d", file="d.onnx", licence="none", source="here", classes=("car", "person"), input_width=64,
         input_height=64, categories={"car": "car", "person": "person"}, sure_scores={"car": 0.2},
     )  # fmt: skip
-    chosen = choose_box_scores(card, Path(), [(picture, (there,))] * 4)
+    chosen = choose_box_scores(card, Path(), [(picture, (there,))] * 4, workers=workers)
     assert chosen.score_thresholds == {"car": BOX_SCORES[0], "person": BOX_SCORES[0]}
     assert chosen.sure_scores == {"car": 0.7, "person": 0.7}, "the ghost scores 0.7, no more"
