@@ -21,7 +21,16 @@ from labeling.model_cards import SHIPPED_CARDS, FieldHeadCard, SimccCard, YoloxC
 from labeling.onnx_model import OnnxModel
 from labeling.schemas import keypoint_schema
 from training.street_augment import AugmentSettings, disturb, map_points, random_map
-from training.street_batches import Batch, CropBatches, FieldBatches, Windows, behind_board, mirror_order, to_input
+from training.street_batches import (
+    Batch,
+    CropBatches,
+    DetectorBatches,
+    FieldBatches,
+    Windows,
+    behind_board,
+    mirror_order,
+    to_input,
+)
 from training.street_export import export_model, fold_norms
 from training.street_fitting import FitSettings, best_precision, fit, rate_at
 from training.street_losses import detector_loss, field_loss, simcc_loss
@@ -32,6 +41,7 @@ from training.street_plans import judging_frames, plan_streets
 from training.street_pool import PICTURE_SIZE, ObjectTruth, PoolCrop, PoolFrame, RenderPlan, StreetPool, render_pool
 from training.street_recipes import MODEL_NAMES, recipe
 from training.street_scores import distance_to_curve
+from training.street_second_look import SecondScores
 from training.street_targets import FieldVotes, encode_boxes, encode_fields, encode_responses
 
 WIDTH, HEIGHT = 256, 192
@@ -540,6 +550,22 @@ def test_every_device_has_a_budget_for_every_model(device) -> None:
     assert all(settings.device == device and settings.steps >= 1000 for settings in fits)
     assert sum(settings.loaders > 0 for settings in fits) == (len(fits) if device == "cuda" else 0)
     assert len({settings.name for settings in fits}) == len(fits)
+
+
+def test_windows_are_judged_within_their_own_border(toy_pool: StreetPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[tuple[int, int]] = []
+
+    def judged(look: SecondScores, *objects: torch.Tensor, size: tuple[int, int], low_px: float) -> torch.Tensor:
+        sizes.append(size)
+        return look.logits.sum()
+
+    monkeypatch.setattr("training.street_recipes.second_look_loss", judged)
+    plan = recipe("street_detector")
+    windows = (Windows(width=128, height=64, count=1),)
+    batches = DetectorBatches(pool=toy_pool, windows=windows, augment=AugmentSettings())
+    for lesson in plan.lessons:
+        lesson.loss(plan.network(), batches(np.random.default_rng(0)))
+    assert sizes == [(128, 64)] * 2
 
 
 @pytest.mark.parametrize("name", MODEL_NAMES)

@@ -186,7 +186,7 @@ def train_all(options: argparse.Namespace) -> None:
         )
     streets = CHOOSING_STREETS * options.judged_streets // JUDGED_STREETS
     frames = list(judging_frames(VALIDATION_SEED, streets, JUDGED_FRAMES, workers=options.workers))
-    choose_thresholds(options.out, options.only, frames, workers=options.workers)
+    choose_thresholds(options.out, options.only, frames)
 
 
 def _needed_pools(jobs: Sequence[_Job], options: argparse.Namespace) -> dict[PoolName, StreetPool]:

@@ -1,7 +1,6 @@
 """Thresholds of the street models, chosen on streets that neither train nor judge: as many exact counts as can be."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -30,50 +29,42 @@ JudgedFrame = tuple[np.ndarray, tuple[ObjectTruth, ...]]
 """(H, W, 3) uint8 RGB, and what is true in it."""
 
 
-def choose_thresholds(folder: Path, names: Sequence[str], frames: Sequence[JudgedFrame], *, workers: int = 1) -> None:
+def choose_thresholds(folder: Path, names: Sequence[str], frames: Sequence[JudgedFrame]) -> None:
     """Write the thresholds that give most frames exact counts into the cards that have any.
 
     Args:
         folder: of the cards and their weights.
         names: of the cards.
         frames: that choose.
-        workers: threads that look at them, of which the choice knows nothing.
     """
     for name in names:
         card = read_card(folder / f"{name}.toml")
         if isinstance(card, YoloxCard):
-            card = choose_box_scores(card, folder, frames, workers=workers)
+            card = choose_box_scores(card, folder, frames)
         elif isinstance(card, CifcafCard):
-            card = choose_object_scores(card, folder, frames, workers=workers)
+            card = choose_object_scores(card, folder, frames)
         write_card(card, folder / f"{name}.toml")
 
 
-def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFrame], *, workers: int = 1) -> YoloxCard:
+def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFrame]) -> YoloxCard:
     """The card with the best threshold of each class, chosen by its own class's counts, and with one sure score.
 
     Sure is what few phantoms reach in bad light: each frame is looked at again in one of ``_BAD_LIGHT``, in turn.
     """
     eager = card.model_copy(update={"score_threshold": BOX_SCORES[0], "score_thresholds": {}})
     detector = Detector(eager, folder / card.file)
-
-    def look(number: int) -> tuple[list[list[bool]], np.ndarray]:
-        """Whether each class's count is exact at each threshold, and phantoms above each sure score."""
-        rgb, truths = frames[number]
+    exact: dict[str, list[list[bool]]] = {name: [] for name in card.class_names}
+    phantoms = np.zeros(len(SURE_SCORES))
+    for number, (rgb, truths) in enumerate(frames):
         harm = _BAD_LIGHT[number % len(_BAD_LIGHT)]
         clear, harmed = detector.detect([rgb, apply_condition(rgb, harm, seed=number, frame=number)])
-        exact, phantoms = [], np.zeros(len(SURE_SCORES))
         for name in card.class_names:
             mine = [truth for truth in truths if truth.category == card.categories[name]]
             seen = clear.select(clear.classes == name)
-            exact.append([sum(judge_count(seen, mine, threshold)) == 0 for threshold in BOX_SCORES])
+            exact[name].append([sum(judge_count(seen, mine, threshold)) == 0 for threshold in BOX_SCORES])
             phantoms += _phantoms_above(harmed.select(harmed.classes == name), mine, SURE_SCORES)
-        return exact, phantoms
-
-    with ThreadPoolExecutor(workers) as pool:
-        looks = list(pool.map(look, range(len(frames))))
-    shares = np.mean([exact for exact, _ in looks], axis=0)
-    best = {name: best_threshold(row, BOX_SCORES) for name, row in zip(card.class_names, shares, strict=True)}
-    sure = sure_threshold(np.mean([phantoms for _, phantoms in looks], axis=0), SURE_SCORES)
+    best = {name: best_threshold(np.mean(rows, axis=0), BOX_SCORES) for name, rows in exact.items()}
+    sure = sure_threshold(phantoms / len(frames), SURE_SCORES)
     return card.model_copy(
         update={
             "score_threshold": min(best.values()), "score_thresholds": best,
@@ -89,16 +80,13 @@ def _phantoms_above(seen: Detections, truths: Sequence[ObjectTruth], scores: Seq
     return (seen.scores[extra] > np.array(scores)[:, None]).sum(axis=1)
 
 
-def choose_object_scores(
-    card: CifcafCard, folder: Path, frames: Sequence[JudgedFrame], *, workers: int = 1
-) -> CifcafCard:
+def choose_object_scores(card: CifcafCard, folder: Path, frames: Sequence[JudgedFrame]) -> CifcafCard:
     """The card with the best threshold of each schema's objects."""
     eager = [head.model_copy(update={"instance_threshold": OBJECT_SCORES[0]}) for head in card.heads]
     model = FieldModel(card.model_copy(update={"heads": tuple(eager)}), folder / card.file)
     tallies = [[Tally() for _ in OBJECT_SCORES] for _ in card.heads]
-    with ThreadPoolExecutor(workers) as pool:
-        looks = list(pool.map(lambda frame: model.estimate([frame[0]])[0], frames))
-    for (_, truths), found in zip(frames, looks, strict=True):
+    for rgb, truths in frames:
+        found = model.estimate([rgb])[0]
         for head, mine in zip(card.heads, tallies, strict=True):
             judge = _FIELD_JUDGES[head.schema_name][1]
             for threshold, tally in zip(OBJECT_SCORES, mine, strict=True):
