@@ -10,8 +10,8 @@ from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
 from labeling.model_cards import YoloxCard
 from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, plan_lessons, plan_streets
 from training.street_pool import ObjectTruth
-from training.street_scores import Tally, grouped_standard_error, judge_car_fields
-from training.street_thresholds import BOX_SCORES, best_threshold, choose_box_scores, judge_count, sure_threshold
+from training.street_scores import Tally, grouped_standard_error, is_judged, judge_car_fields, match_boxes
+from training.street_thresholds import BOX_SCORES, best_threshold, choose_box_scores, judge_counts, sure_threshold
 
 
 def car(left: float, *, height: float = 60.0, share: float = 1.0) -> ObjectTruth:
@@ -47,9 +47,24 @@ def bottom_up(truth: ObjectTruth, *, off_px: float = 0.0) -> Keypoints:
 def test_counts_are_exact_where_all_judged_objects_and_nothing_else_is_found() -> None:
     truths = [car(0), car(200), car(400, height=20), car(600, share=0.2)]
     found = detections([*truths, car(800)], [0.9, 0.5, 0.5, 0.5, 0.4])
-    assert judge_count(found, truths, 0.45) == (0, 0), "objects that are not judged may be found"
-    assert judge_count(found, truths, 0.6) == (1, 0), "one is missed"
-    assert judge_count(found, truths, 0.3) == (0, 1), "one is not there"
+    missed, phantoms = judge_counts(found, truths, (0.3, 0.45, 0.6))
+    assert missed.tolist() == [0, 0, 1], "objects that are not judged may be found"
+    assert phantoms.tolist() == [1, 0, 0], "one is not there"
+
+
+def test_counts_at_each_threshold_are_as_if_lower_scores_were_not_there() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(40):
+        places = rng.integers(0, 12, (2, 6)) * 30.0
+        truths = [car(left, height=rng.choice([20, 60]), share=rng.choice([0.2, 1.0])) for left in places[0]]
+        truths = truths[: rng.integers(0, 7)]
+        scores = sorted(rng.choice([0.2, 0.4, 0.5, 0.7, 0.9], rng.integers(0, 7)), reverse=True)
+        found = detections([car(left) for left in places[1, : len(scores)]], scores)
+        missed, phantoms = judge_counts(found, truths, BOX_SCORES)
+        for index, threshold in enumerate(BOX_SCORES):
+            partner, extra = match_boxes(found.boxes_xyxy[found.scores > threshold], truths)
+            wanted = [at for at, truth in zip(partner, truths, strict=True) if is_judged(truth)]
+            assert missed[index] == sum(at < 0 for at in wanted) and phantoms[index] == len(extra)
 
 
 def test_a_track_may_begin_where_phantoms_are_few() -> None:

@@ -53,16 +53,16 @@ def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFram
     """
     eager = card.model_copy(update={"score_threshold": BOX_SCORES[0], "score_thresholds": {}})
     detector = Detector(eager, folder / card.file)
-    exact: dict[str, list[list[bool]]] = {name: [] for name in card.class_names}
+    exact: dict[str, list[np.ndarray]] = {name: [] for name in card.class_names}
     phantoms = np.zeros(len(SURE_SCORES))
     for number, (rgb, truths) in enumerate(frames):
         harm = _BAD_LIGHT[number % len(_BAD_LIGHT)]
         clear, harmed = detector.detect([rgb, apply_condition(rgb, harm, seed=number, frame=number)])
         for name in card.class_names:
             mine = [truth for truth in truths if truth.category == card.categories[name]]
-            seen = clear.select(clear.classes == name)
-            exact[name].append([sum(judge_count(seen, mine, threshold)) == 0 for threshold in BOX_SCORES])
-            phantoms += _phantoms_above(harmed.select(harmed.classes == name), mine, SURE_SCORES)
+            missed, extra = judge_counts(clear.select(clear.classes == name), mine, BOX_SCORES)
+            exact[name].append(missed + extra == 0)
+            phantoms += judge_counts(harmed.select(harmed.classes == name), mine, SURE_SCORES)[1]
     best = {name: best_threshold(np.mean(rows, axis=0), BOX_SCORES) for name, rows in exact.items()}
     sure = sure_threshold(phantoms / len(frames), SURE_SCORES)
     return card.model_copy(
@@ -71,13 +71,6 @@ def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFram
             "sure_scores": {name: max(score, sure) for name, score in best.items()},
         }
     )  # fmt: skip
-
-
-def _phantoms_above(seen: Detections, truths: Sequence[ObjectTruth], scores: Sequence[float]) -> np.ndarray:
-    """(n,) how many phantoms score more than each of n scores."""
-    # Matches are made best first: those above a score are the first of all.
-    _, extra = match_boxes(seen.boxes_xyxy, truths)
-    return (seen.scores[extra] > np.array(scores)[:, None]).sum(axis=1)
 
 
 def choose_object_scores(card: CifcafCard, folder: Path, frames: Sequence[JudgedFrame]) -> CifcafCard:
@@ -110,11 +103,17 @@ _FIELD_JUDGES: dict[str, tuple[str, Callable[[Sequence[Keypoints], tuple[ObjectT
 }
 
 
-def judge_count(found: Detections, truths: Sequence[ObjectTruth], threshold: float) -> tuple[int, int]:
-    """How many objects that are judged the detections above a score miss, and how many phantoms are among them."""
-    partner, phantoms = match_boxes(found.boxes_xyxy[found.scores > threshold], truths)
-    missed = sum(at < 0 and is_judged(truth) for at, truth in zip(partner, truths, strict=True))
-    return missed, len(phantoms)
+def judge_counts(
+    found: Detections, truths: Sequence[ObjectTruth], thresholds: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) how many objects that are judged the detections above each of n scores miss, and (n,) how many phantoms are
+    among them; detections come best first."""
+    # So are matches made: what scores more than a threshold is matched as if the rest were not there.
+    partner, phantoms = match_boxes(found.boxes_xyxy, truths)
+    judged = np.array([is_judged(truth) for truth in truths], bool)
+    scores = np.append(found.scores, -np.inf)
+    least = np.array(thresholds, np.float32)[:, None]
+    return (scores[partner[judged]] <= least).sum(axis=1), (scores[phantoms] > least).sum(axis=1)
 
 
 def sure_threshold(phantoms_per_frame: np.ndarray, candidates: Sequence[float]) -> float:
