@@ -11,7 +11,7 @@ from labeling.model_cards import YoloxCard
 from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, plan_lessons, plan_streets
 from training.street_pool import ObjectTruth
 from training.street_scores import Tally, grouped_standard_error, is_judged, judge_car_fields, match_boxes
-from training.street_thresholds import BOX_SCORES, best_threshold, choose_box_scores, judge_counts, sure_threshold
+from training.street_thresholds import BOX_SCORES, BoxScoreChooser, best_threshold, judge_counts, sure_threshold
 
 
 def car(left: float, *, height: float = 60.0, share: float = 1.0) -> ObjectTruth:
@@ -157,6 +157,9 @@ def test_sure_is_what_phantoms_in_bad_light_do_not_reach(monkeypatch: pytest.Mon
         name="d", file="d.onnx", licence="none", source="here", classes=("car", "person"), input_width=64,
         input_height=64, categories={"car": "car", "person": "person"}, sure_scores={"car": 0.2},
     )  # fmt: skip
-    chosen = choose_box_scores(card, Path(), [(picture, (there,)) for picture in pictures])
+    chooser = BoxScoreChooser(card, Path())
+    for picture in pictures:
+        chooser.add(picture, (there,))
+    chosen = chooser.chosen()
     assert chosen.score_thresholds == {"car": BOX_SCORES[0], "person": BOX_SCORES[0]}
     assert chosen.sure_scores == {"car": 0.7, "person": 0.7}, "the ghost scores 0.7, no more"

@@ -17,6 +17,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 from multiprocessing import get_context
 from pathlib import Path
 from typing import get_args
@@ -33,14 +34,13 @@ from training.street_export import export_model
 from training.street_fitting import fit, is_finished, load_finished
 from training.street_plans import (
     HELD_OUT_SEED,
-    SECOND_LOOK_SEED,
     TRAIN_SEED,
     VALIDATION_SEED,
     judging_frames,
     plan_lessons,
 )
 from training.street_pool import StreetPool, render_pool
-from training.street_recipes import BUDGETS, MODEL_NAMES, Device, Lesson, ModelName, PoolName, Recipe, recipe
+from training.street_recipes import BUDGETS, MODEL_NAMES, Device, Lesson, ModelName, Recipe, recipe
 from training.street_scores import StreetModels, Tally, grouped_standard_error, judge_frame
 from training.street_thresholds import choose_thresholds
 
@@ -78,23 +78,28 @@ class _Job:
         return () if self.has_learnt(lessons[-1]) else tuple(one for one in lessons if not self.has_learnt(one))
 
 
-_shared_pools: dict[PoolName, StreetPool] = {}
+_shared_pool: list[StreetPool] = []
+"""The one that is learnt from: forked workers see it where it is, which takes no time; to send it takes longer than to
+render it."""
 
 
-def _train_models(jobs: Sequence[_Job], pools: dict[PoolName, StreetPool], *, at_once: int) -> None:
-    """Train models side by side, one thread each, in the order given; no model's weights depend on company."""
-    _shared_pools.clear()
-    _shared_pools.update(pools)
-    # Forked workers see the pool where it is: it would take longer to send than to render.
-    with ProcessPoolExecutor(min(at_once, len(jobs)), mp_context=get_context("fork")) as processes:
-        for name, seconds in processes.map(_train, jobs):
-            print(f"{name} trained in {seconds:.0f} s", flush=True)
+def _train_models(jobs: Sequence[_Job], pool: StreetPool, *, at_once: int) -> None:
+    """Train models side by side in the order given, first those lessons that take one thread; no model's weights depend
+    on company."""
+    _shared_pool[:] = [pool]
+    for threads in sorted({lesson.threads for job in jobs for lesson in job.unfinished}):
+        mine = [job for job in jobs if any(lesson.threads == threads for lesson in job.unfinished)]
+        side_by_side = max(1, min(at_once // threads, len(mine)))
+        with ProcessPoolExecutor(side_by_side, mp_context=get_context("fork")) as processes:
+            for name, seconds in processes.map(_train, mine, repeat(threads)):
+                print(f"{name} trained in {seconds:.0f} s, {threads} thread(s)", flush=True)
     # Gigabytes, which judging needs for pictures of its own.
-    _shared_pools.clear()
+    _shared_pool.clear()
 
 
-def _train(job: _Job) -> tuple[str, float]:
-    torch.set_num_threads(1)
+def _train(job: _Job, threads: int) -> tuple[str, float]:
+    """Those lessons of a model that take so many threads; fewer come first."""
+    torch.set_num_threads(threads)
     torch.backends.cudnn.benchmark = True
     _keep_memory()
     start = time.perf_counter()
@@ -104,8 +109,8 @@ def _train(job: _Job) -> tuple[str, float]:
     for lesson in plan.lessons:
         if job.has_learnt(lesson):
             network = load_finished(network, job.checkpoint(lesson))
-        else:
-            batches = lesson.batches(_shared_pools[lesson.pool])
+        elif lesson.threads == threads:
+            batches = lesson.batches(*_shared_pool)
             network = fit(network, batches, lesson.loss, lesson.fit, checkpoint=job.checkpoint(lesson))
     return job.name, time.perf_counter() - start
 
@@ -176,7 +181,8 @@ def train_all(options: argparse.Namespace) -> None:
         # Counted without opening the GPU, which forked processes could not use then.
         if options.device == "cuda" and not torch.cuda.device_count():
             raise SystemExit("--device cuda: torch sees no GPU; leave it out, or name finished --checkpoints")
-        _train_models(missing, _needed_pools(missing, options), at_once=BUDGETS[options.device].jobs)
+        budget = BUDGETS[options.device]
+        _train_models(missing, _rendered(options.streets or budget.streets, options.workers), at_once=budget.jobs)
     if options.train_only:
         return
     for job in jobs:
@@ -185,24 +191,13 @@ def train_all(options: argparse.Namespace) -> None:
             plan.graph(load_finished(plan.network(), job.checkpoint(plan.lessons[-1]))), plan.card, options.out
         )
     streets = CHOOSING_STREETS * options.judged_streets // JUDGED_STREETS
-    frames = list(judging_frames(VALIDATION_SEED, streets, JUDGED_FRAMES, workers=options.workers))
+    frames = judging_frames(VALIDATION_SEED, streets, JUDGED_FRAMES, workers=options.workers)
     choose_thresholds(options.out, options.only, frames)
 
 
-def _needed_pools(jobs: Sequence[_Job], options: argparse.Namespace) -> dict[PoolName, StreetPool]:
-    budget = BUDGETS[options.device]
-    needed = {lesson.pool for job in jobs for lesson in job.unfinished}
-    pools: dict[PoolName, StreetPool] = {}
-    if "first" in needed:
-        pools["first"] = _rendered(TRAIN_SEED, options.streets or budget.streets, options.workers)
-    if "others" in needed:
-        pools["others"] = _rendered(SECOND_LOOK_SEED, options.streets or budget.other_streets, options.workers)
-    return pools
-
-
-def _rendered(first_seed: int, streets: int, workers: int) -> StreetPool:
+def _rendered(streets: int, workers: int) -> StreetPool:
     start = time.perf_counter()
-    pool = render_pool(plan_lessons(first_seed, streets, frames=7, every=15), workers=workers)
+    pool = render_pool(plan_lessons(TRAIN_SEED, streets, frames=7, every=15), workers=workers)
     counts = {name: len(found) for name, found in pool.crops.items()}
     print(f"{len(pool.frames)} frames, crops {counts}, {time.perf_counter() - start:.0f} s", flush=True)
     return pool

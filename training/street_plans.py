@@ -12,7 +12,7 @@ import numpy as np
 from dataset.street import Scenario, Street, StreetConfig
 from training.street_pool import ObjectTruth, RenderPlan, truths_of
 
-TRAIN_SEED, SECOND_LOOK_SEED, VALIDATION_SEED, HELD_OUT_SEED = 20_000, 30_000, 90_000, 95_000
+TRAIN_SEED, VALIDATION_SEED, HELD_OUT_SEED = 20_000, 90_000, 95_000
 """First street seed of each set: no street is in two of them. Thresholds are chosen on the validation set alone."""
 PLANNED: tuple[Scenario, ...] = (
     "drive", "traffic", "crossing", "stop_and_go", "parked", "traffic", "turn", "cross_traffic", "drive", "crossing",

@@ -87,11 +87,11 @@ class Budget:
 
     streets: int
     """To learn from."""
-    other_streets: int
-    """For the detector's second lesson: those that its first never saw, on which it is no better than elsewhere."""
     steps: dict[ModelName, int]
     second_steps: int
     """Of the detector's second lesson."""
+    second_threads: int
+    """Processor threads of that lesson, which comes when all else is through."""
     enlarge: int
     """Batches are so many times as large as those of a core."""
     loaders: dict[ModelName, int]
@@ -101,15 +101,13 @@ class Budget:
 
 
 Device = Literal["cpu", "cuda"]
-PoolName = Literal["first", "others"]
-"""Streets that the pictures of a lesson are of."""
 BUDGETS: dict[Device, Budget] = {
     "cpu": Budget(
-        streets=384, other_streets=200, second_steps=2650, enlarge=1, loaders=dict.fromkeys(MODEL_NAMES, 0), jobs=2,
-        steps={"street_detector": 4900, "street_fields": 4000, "street_coco17": 8000, "street_car24": 3000},
+        streets=584, second_steps=2450, second_threads=2, enlarge=1, jobs=2, loaders=dict.fromkeys(MODEL_NAMES, 0),
+        steps={"street_detector": 4700, "street_fields": 1650, "street_coco17": 6200, "street_car24": 2300},
     ),
     "cuda": Budget(
-        streets=960, other_streets=800, second_steps=2400, enlarge=4, jobs=4,
+        streets=1760, second_steps=2400, second_threads=1, enlarge=4, jobs=4,
         loaders={"street_detector": 6, "street_fields": 4, "street_coco17": 2, "street_car24": 1},
         steps={"street_detector": 14000, "street_fields": 6000, "street_coco17": 9000, "street_car24": 4000},
     ),
@@ -126,7 +124,8 @@ class Lesson:
     batches: Callable[[StreetPool], Callable[[Any], Batch]]
     loss: Callable[[nn.Module, Batch], torch.Tensor]
     fit: FitSettings
-    pool: PoolName = "first"
+    threads: int = 1
+    """Of the processor. Lessons of more threads come when those of fewer are through, of all models."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,15 +157,16 @@ def recipe(name: ModelName, *, device: Device = "cpu", seed: int = 1, share: flo
             settings, name=f"{name}_second_lesson", steps=max(1, round(budget.second_steps * share)),
             learning_rate=_SECOND_RATE, fixed_norms=True,
         )  # fmt: skip
-        return _detector_recipe(settings, again, budget.enlarge)
+        return _detector_recipe(settings, again, budget)
     if name == "street_fields":
         return _field_recipe(settings, budget.enlarge)
     return _head_recipe(name.removeprefix("street_"), settings, budget.enlarge)
 
 
-def _detector_recipe(settings: FitSettings, again: FitSettings, enlarge: int) -> Recipe:
+def _detector_recipe(settings: FitSettings, again: FitSettings, budget: Budget) -> Recipe:
     first_windows, second_windows = (
-        tuple(replace(one, count=one.count * enlarge) for one in windows) for windows in (_WINDOWS, _SECOND_WINDOWS)
+        tuple(replace(one, count=one.count * budget.enlarge) for one in windows)
+        for windows in (_WINDOWS, _SECOND_WINDOWS)
     )
 
     def loss(network: nn.Module, batch: Batch) -> torch.Tensor:
@@ -193,7 +193,7 @@ def _detector_recipe(settings: FitSettings, again: FitSettings, enlarge: int) ->
         batches=lambda pool: DetectorBatches(
             pool=pool, windows=second_windows, augment=_SECOND_AUGMENT, plain_share=0.3, person_share=0.4,
         ),
-        fit=again, loss=loss, pool="others",
+        fit=again, loss=loss, threads=budget.second_threads,
     )  # fmt: skip
     return Recipe(card=card, network=lambda: TwoLookDetector(len(CLASSES)), graph=TwoLookGraph, lessons=(first, second))
 

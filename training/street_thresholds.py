@@ -1,6 +1,6 @@
 """Thresholds of the street models, chosen on streets that neither train nor judge: as many exact counts as can be."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,68 +29,94 @@ JudgedFrame = tuple[np.ndarray, tuple[ObjectTruth, ...]]
 """(H, W, 3) uint8 RGB, and what is true in it."""
 
 
-def choose_thresholds(folder: Path, names: Sequence[str], frames: Sequence[JudgedFrame]) -> None:
+def choose_thresholds(folder: Path, names: Sequence[str], frames: Iterable[JudgedFrame]) -> None:
     """Write the thresholds that give most frames exact counts into the cards that have any.
 
     Args:
         folder: of the cards and their weights.
         names: of the cards.
-        frames: that choose.
+        frames: that choose; gone through once, so that they may be rendered meanwhile.
     """
+    choosers: list[BoxScoreChooser | ObjectScoreChooser] = []
     for name in names:
         card = read_card(folder / f"{name}.toml")
         if isinstance(card, YoloxCard):
-            card = choose_box_scores(card, folder, frames)
+            choosers.append(BoxScoreChooser(card, folder))
         elif isinstance(card, CifcafCard):
-            card = choose_object_scores(card, folder, frames)
-        write_card(card, folder / f"{name}.toml")
+            choosers.append(ObjectScoreChooser(card, folder))
+    if not choosers:
+        return
+    for rgb, truths in frames:
+        for chooser in choosers:
+            chooser.add(rgb, truths)
+    for chooser in choosers:
+        card = chooser.chosen()
+        write_card(card, folder / f"{card.name}.toml")
 
 
-def choose_box_scores(card: YoloxCard, folder: Path, frames: Sequence[JudgedFrame]) -> YoloxCard:
-    """The card with the best threshold of each class, chosen by its own class's counts, and with one sure score.
+class BoxScoreChooser:
+    """The best threshold of each class, by its own class's counts, and one sure score.
 
     Sure is what few phantoms reach in bad light: each frame is looked at again in one of ``_BAD_LIGHT``, in turn.
     """
-    eager = card.model_copy(update={"score_threshold": BOX_SCORES[0], "score_thresholds": {}})
-    detector = Detector(eager, folder / card.file)
-    exact: dict[str, list[np.ndarray]] = {name: [] for name in card.class_names}
-    phantoms = np.zeros(len(SURE_SCORES))
-    for number, (rgb, truths) in enumerate(frames):
-        harm = _BAD_LIGHT[number % len(_BAD_LIGHT)]
-        clear, harmed = detector.detect([rgb, apply_condition(rgb, harm, seed=number, frame=number)])
-        for name in card.class_names:
-            mine = [truth for truth in truths if truth.category == card.categories[name]]
+
+    def __init__(self, card: YoloxCard, folder: Path) -> None:
+        self._card = card
+        eager = card.model_copy(update={"score_threshold": BOX_SCORES[0], "score_thresholds": {}})
+        self._detector = Detector(eager, folder / card.file)
+        self._exact: dict[str, list[np.ndarray]] = {name: [] for name in card.class_names}
+        self._phantoms = np.zeros(len(SURE_SCORES))
+        self._frames = 0
+
+    def add(self, rgb: np.ndarray, truths: Sequence[ObjectTruth]) -> None:
+        """Look at one frame."""
+        harm = _BAD_LIGHT[self._frames % len(_BAD_LIGHT)]
+        harmed_rgb = apply_condition(rgb, harm, seed=self._frames, frame=self._frames)
+        clear, harmed = self._detector.detect([rgb, harmed_rgb])
+        for name, exact in self._exact.items():
+            mine = [truth for truth in truths if truth.category == self._card.categories[name]]
             missed, extra = judge_counts(clear.select(clear.classes == name), mine, BOX_SCORES)
-            exact[name].append(missed + extra == 0)
-            phantoms += judge_counts(harmed.select(harmed.classes == name), mine, SURE_SCORES)[1]
-    best = {name: best_threshold(np.mean(rows, axis=0), BOX_SCORES) for name, rows in exact.items()}
-    sure = sure_threshold(phantoms / len(frames), SURE_SCORES)
-    return card.model_copy(
-        update={
-            "score_threshold": min(best.values()), "score_thresholds": best,
-            "sure_scores": {name: max(score, sure) for name, score in best.items()},
-        }
-    )  # fmt: skip
+            exact.append(missed + extra == 0)
+            self._phantoms += judge_counts(harmed.select(harmed.classes == name), mine, SURE_SCORES)[1]
+        self._frames += 1
+
+    def chosen(self) -> YoloxCard:
+        """The card with the scores that the frames so far ask for."""
+        best = {name: best_threshold(np.mean(rows, axis=0), BOX_SCORES) for name, rows in self._exact.items()}
+        sure = sure_threshold(self._phantoms / self._frames, SURE_SCORES)
+        return self._card.model_copy(
+            update={
+                "score_threshold": min(best.values()), "score_thresholds": best,
+                "sure_scores": {name: max(score, sure) for name, score in best.items()},
+            }
+        )  # fmt: skip
 
 
-def choose_object_scores(card: CifcafCard, folder: Path, frames: Sequence[JudgedFrame]) -> CifcafCard:
-    """The card with the best threshold of each schema's objects."""
-    eager = [head.model_copy(update={"instance_threshold": OBJECT_SCORES[0]}) for head in card.heads]
-    model = FieldModel(card.model_copy(update={"heads": tuple(eager)}), folder / card.file)
-    tallies = [[Tally() for _ in OBJECT_SCORES] for _ in card.heads]
-    for rgb, truths in frames:
-        found = model.estimate([rgb])[0]
-        for head, mine in zip(card.heads, tallies, strict=True):
+class ObjectScoreChooser:
+    """The best threshold of each schema's bottom-up objects."""
+
+    def __init__(self, card: CifcafCard, folder: Path) -> None:
+        self._card = card
+        eager = [head.model_copy(update={"instance_threshold": OBJECT_SCORES[0]}) for head in card.heads]
+        self._model = FieldModel(card.model_copy(update={"heads": tuple(eager)}), folder / card.file)
+        self._tallies = [[Tally() for _ in OBJECT_SCORES] for _ in card.heads]
+
+    def add(self, rgb: np.ndarray, truths: tuple[ObjectTruth, ...]) -> None:
+        """Look at one frame."""
+        found = self._model.estimate([rgb])[0]
+        for head, mine in zip(self._card.heads, self._tallies, strict=True):
             judge = _FIELD_JUDGES[head.schema_name][1]
+            objects = [one for one in found if one.schema == head.schema_name]
             for threshold, tally in zip(OBJECT_SCORES, mine, strict=True):
-                judge(
-                    [one for one in found if one.schema == head.schema_name and one.score >= threshold], truths, tally
-                )
-    heads = []
-    for head, mine in zip(card.heads, tallies, strict=True):
-        shares = np.array([tally.figures()[_FIELD_JUDGES[head.schema_name][0]] for tally in mine])
-        heads.append(head.model_copy(update={"instance_threshold": best_threshold(shares, OBJECT_SCORES)}))
-    return card.model_copy(update={"heads": tuple(heads)})
+                judge([one for one in objects if one.score >= threshold], truths, tally)
+
+    def chosen(self) -> CifcafCard:
+        """The card with the scores that the frames so far ask for."""
+        heads = []
+        for head, mine in zip(self._card.heads, self._tallies, strict=True):
+            shares = np.array([tally.figures()[_FIELD_JUDGES[head.schema_name][0]] for tally in mine])
+            heads.append(head.model_copy(update={"instance_threshold": best_threshold(shares, OBJECT_SCORES)}))
+        return self._card.model_copy(update={"heads": tuple(heads)})
 
 
 def _judge_lanes(found: Sequence[Keypoints], truths: tuple[ObjectTruth, ...], tally: Tally) -> None:
