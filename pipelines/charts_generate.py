@@ -1,7 +1,8 @@
 """``animatic chart generate``: ms a clip against error for denoising steps, guidance and number of motion drafts."""
 
+import contextlib
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -60,17 +61,29 @@ def chart(name: str, *, quick: bool = False) -> Chart:
     Draft i starts from the noise of future i: six drafts lack only what fewer steps cost, one lacks five futures.
     """
     methods = (_TRIVIAL, _METHODS[1], _REFERENCE) if quick else _METHODS
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, _one_thread():
         generator = _taught(Path(folder), steps=4 if quick else 150)
         conditions = _Walk(key="walk_0", speed=2.0).conditions()
         futures = _drafts(generator, conditions, _REFERENCE)
         points = [_errors(_drafts(generator, conditions, method), futures) for method in methods]
-        costs = interleaved_ms([partial(_clip, generator, conditions, method) for method in methods], runs=1)
+        clips = [partial(_clip, generator, conditions, method) for method in methods]
+        costs = interleaved_ms(clips, runs=1 if quick else 5)
     return Chart(
         stage=name, cost="ms_per_clip", machine=machine_name(),
         data=f"tiny backbone, {_FRAMES} frames of {_WIDTH}x{_HEIGHT}, n motion drafts and one painted",
         points=tuple(_point(*row) for row in zip(methods, costs, points, strict=True)),
     )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """As the chart says: processor time counts threads that wait for one another as well."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _clip(generator: ClipGenerator, conditions: ClipConditions, method: _Method) -> int:

@@ -37,3 +37,21 @@ def test_methods_have_distinct_names_and_the_yardstick_is_among_them() -> None:
     names = [method.name for method in charts_generate._METHODS]
     assert len(set(names)) == len(names)
     assert charts_generate._REFERENCE in charts_generate._METHODS
+
+
+def test_clips_are_timed_on_the_one_thread_that_the_chart_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+
+    def interrupted(*_: object, **__: object) -> None:
+        seen.append(torch.get_num_threads())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(charts_generate, "_taught", interrupted)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            charts_generate.chart("generate")
+        assert seen == [1] and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
