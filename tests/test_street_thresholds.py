@@ -7,11 +7,20 @@ import pytest
 
 from labeling.detection import Detections
 from labeling.labels import POINT_ABSENT, POINT_DETECTED, Keypoints
-from labeling.model_cards import YoloxCard
+from labeling.model_cards import SHIPPED_CARDS, YoloxCard
+from training.street_models import CHOOSING_STREETS, JUDGED_STREETS
 from training.street_plans import HELD_OUT_SEED, TRAIN_SEED, VALIDATION_SEED, plan_lessons, plan_streets
 from training.street_pool import ObjectTruth
+from training.street_recipes import BUDGETS
 from training.street_scores import Tally, grouped_standard_error, is_judged, judge_car_fields, match_boxes
-from training.street_thresholds import BOX_SCORES, BoxScoreChooser, best_threshold, judge_counts, sure_threshold
+from training.street_thresholds import (
+    BOX_SCORES,
+    BoxScoreChooser,
+    best_threshold,
+    choose_thresholds,
+    judge_counts,
+    sure_threshold,
+)
 
 
 def car(left: float, *, height: float = 60.0, share: float = 1.0) -> ObjectTruth:
@@ -67,6 +76,12 @@ def test_counts_at_each_threshold_are_as_if_lower_scores_were_not_there() -> Non
             assert missed[index] == sum(at < 0 for at in wanted) and phantoms[index] == len(extra)
 
 
+def test_where_no_card_has_a_threshold_no_frame_is_rendered() -> None:
+    asked = iter([(np.zeros((4, 4, 3), np.uint8), ())])
+    choose_thresholds(SHIPPED_CARDS, ["street_car24", "street_coco17"], asked)
+    assert len(list(asked)) == 1
+
+
 def test_a_track_may_begin_where_phantoms_are_few() -> None:
     falling = np.linspace(0.2, 0.0, len(BOX_SCORES))
     chosen = BOX_SCORES.index(sure_threshold(falling, BOX_SCORES))
@@ -108,9 +123,10 @@ def test_missed_bottom_up_cars_and_phantoms_count_against_the_model() -> None:
 
 
 def test_no_street_both_trains_chooses_and_judges() -> None:
+    most = max(budget.streets for budget in BUDGETS.values())
     plans = [
-        plan_lessons(TRAIN_SEED, 400, frames=7, every=15), plan_streets(VALIDATION_SEED, 30),
-        plan_streets(HELD_OUT_SEED, 30),
+        plan_lessons(TRAIN_SEED, most, frames=7, every=15), plan_streets(VALIDATION_SEED, CHOOSING_STREETS),
+        plan_streets(HELD_OUT_SEED, JUDGED_STREETS),
     ]  # fmt: skip
     seeds = [{plan.config.seed for plan in each} for each in plans]
     assert len(set.union(*seeds)) == sum(map(len, seeds))
